@@ -1,7 +1,7 @@
-"""Materials and light from ordinary photographs: Lambert + GGX per material, an HDR environment map per photo.
+"""Materials and light from ordinary photographs: Lambert + GGX per material, an HDR environment map per light.
 
 Importing this package imports nothing heavy.  `from factorlib.reflection import reflection_operator` and the like load
-what they need.  `factorlib.load_result` does so on first access.
+what they need.  `factorlib.load_result` is also loaded on first access.
 """
 
 import os

@@ -1,7 +1,7 @@
 """The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`.
 
-`argparse` reads it, because a run with nothing to do must not wait for a heavier library.  Environment variables supply
-what the command line omits: make passes NAME=value on this way, untouched by any shell.
+`argparse` reads it, because a run with nothing to do must not wait for a heavier library.  An option that is not given
+has the value of an environment variable, by which make passes NAME=value on without a shell.
 """
 
 from __future__ import annotations
@@ -55,7 +55,11 @@ def dataset_of(arguments: Namespace) -> str:
 
 
 def switched_on(key: str, option: bool) -> bool:
-    """Return True if an option, or the environment's `key`, is on; InputError for a value other than 0, 1 and empty."""
+    """Return True if an option is given, or the environment variable `key` is 1.
+
+    Raises:
+        InputError: The variable is neither 0 nor 1 nor empty.
+    """
     word = os.environ.get(key, "")
     if not option and word not in ("", "0", "1"):
         raise InputError(f"{word!r} is neither 1 nor 0", key=key, cure=f"write {key}=1, or leave it out")
@@ -100,7 +104,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def add_option(parser: argparse.ArgumentParser, name: str) -> None:
-    """Add an option, whose default is in the environment, to a verb."""
+    """Add an option to the parser of a verb; the default is the value of its environment variable."""
     more = {"key": "", **OPTIONS[name]}
     if key := more.pop("key"):
         value = os.environ.get(key)
@@ -114,7 +118,7 @@ def add_option(parser: argparse.ArgumentParser, name: str) -> None:
 
 
 def request(arguments: Namespace, stages: list[str] | None = None) -> Request:
-    """Return the request of the command line; without `stages` it is for all of them."""
+    """Return the request that the options describe; without `stages` it is for all stages."""
     force = getattr(arguments, "force", False)
     return Request(dataset_of(arguments), stages or None, arguments.set, force, arguments.recipe)
 
@@ -183,7 +187,7 @@ def run(words: list[str], program: str) -> int:
 
 @contextlib.contextmanager
 def raise_on_signals() -> Iterator[None]:
-    """Raise SystemExit on SIGTERM and KeyboardInterrupt on SIGINT, once; later signals do not disturb cleaning up."""
+    """Raise SystemExit at SIGTERM or KeyboardInterrupt at SIGINT inside; later signals are ignored during clean-up."""
     in_main_thread = threading.current_thread() is threading.main_thread()  # Python sets handlers in no other thread.
     numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, _stop) for number in numbers}

@@ -33,7 +33,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file; InputError for another file."""
+    """Read a JSON file; InputError if it cannot be read or is not JSON."""
     text = read_text(path, "JSON")
     with reading("JSON", path, cure="delete it and run its stage again"):
         return json.loads(text)

@@ -101,8 +101,8 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     above = _check_target(target)
     images = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
     if not images:
-        fault = f"there are no photos ({', '.join(IMAGES[:6])}, …) in it"
-        raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
+        fault = f"the folder has no photos ({', '.join(IMAGES[:6])}, …)"
+        raise InputError(fault, file=photos, key="PHOTOS", cure="name the folder of the photos")
     mask_files = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks is not None else []
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # including .mtl and buffers
     missing: list[str] = []
@@ -136,11 +136,11 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
 def _check_target(target: Path) -> Path:
     """Return the folder in which the target can be created.  Raises InputError where it cannot be."""
     if not target.name.isprintable():
-        raise InputError(f"{target.name!a} cannot be printed", key="DATASET", cure="choose another name")
+        raise InputError(f"the name {target.name!a} cannot be printed", key="DATASET", cure="choose another name")
     if os.path.lexists(target):
-        raise InputError("is there already", file=target, key="DATASET", cure="choose another name, or delete it")
+        raise InputError("exists already", file=target, key="DATASET", cure="choose another name, or delete it")
     if not (above := next(path for path in target.absolute().parents if os.path.lexists(path))).is_dir():
-        raise InputError("is no folder", file=above, key="DATASET", cure="name a folder that can be made")
+        raise InputError("is not a folder", file=above, key="DATASET", cure="name a dataset in an existing folder")
     return above
 
 
@@ -195,9 +195,9 @@ def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[P
             write_text(draft / "dataset.yaml", REMARK + text)
             draft.rename(target)
     except OSError as error:
-        cure = "name a folder that can be made"
+        cure = "name another folder for the dataset"
         known = disk_error(error, target.parent)
-        raise known or InputError("no folder can be made here", file=above, key="DATASET", cure=cure) from error
+        raise known or InputError("no folder can be created here", file=above, key="DATASET", cure=cure) from error
 
 
 def _copy(source: Path, target: Path, files: Iterable[Path]) -> None:
@@ -329,11 +329,11 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
                 if yes and each[0] != usual:
                     obj.setdefault("materials", {})[part] = materials[each[0] - 1]
                 elif not yes and HIDDEN not in each[:2]:  # not if the part may be hidden
-                    obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'not told by the mask'}"
+                    obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'unknown from the mask'}"
                     missing.append(f"photo {photo}: write which material {part} of {obj['name']} is made of")
         if known:
             parts = ", ".join(known)
-            missing.append(f"mesh {name}: look whether {parts} got the right materials, from silhouettes alone")
+            missing.append(f"mesh {name}: check the materials of {parts}, which were derived from silhouettes alone")
 
 
 def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[str], Path]) -> Silhouette:
@@ -365,16 +365,18 @@ def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool 
     `deep` includes its subfolders.  `suffixes` is None for any suffix.
     """
     if not folder.is_dir():
-        raise InputError("there is no such folder", file=folder, key=key, cure="name one")
+        raise InputError("there is no such folder", file=folder, key=key, cure="correct the path")
     paths = []
     for path in folder.rglob("*") if deep else folder.iterdir():
         if path.name.startswith("._") or (suffixes is not None and path.suffix.lower() not in suffixes):
             continue
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            cure = "put the file itself there, or take it away"
-            raise InputError("is a link, or no file of this folder's own", file=path, key=key, cure=cure)
+            cure = "put a copy of the file there, or remove it"
+            raise InputError("is a link, or not a plain file", file=path, key=key, cure=cure)
         if not path.name.isprintable():
-            raise InputError(f"{path.name!a} cannot be printed", file=folder, key=key, cure="rename that file")
+            raise InputError(
+                f"the file name {path.name!a} cannot be printed", file=folder, key=key, cure="rename that file"
+            )
         if path.is_file():
             paths.append(path)
     return sorted(paths)

@@ -44,13 +44,13 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
         InputError: A needed stage has no result, `out` is not the name of a zip file, or it exists already.
     """
     check_whole(home, (*NEEDED, "export/dataset.json"))
-    if out.suffix != ".zip" or out.is_dir() or not out.absolute().parent.is_dir():
-        raise InputError(
-            "a zip file cannot be written here",
-            file=out,
-            key="OUT",
-            cure="name a .zip file in an existing folder: OUT=<name>.zip",
-        )
+    faults = {
+        "is a folder, not a zip file": out.is_dir(),
+        "its name does not end in .zip": out.suffix != ".zip",
+        "the folder that it would be in does not exist": not out.absolute().parent.is_dir(),
+    }
+    if fault := next((fault for fault, applies in faults.items() if applies), None):
+        raise InputError(fault, file=out, key="OUT", cure="write OUT=<name>.zip")
     if out.exists() and not replace:
         raise InputError(
             "the file exists already", file=out, key="OUT", cure="name another file, or add FORCE=1 to replace it"

@@ -31,7 +31,7 @@ FAILURES = (
     *(OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, AssertionError, RuntimeError),
     *(MemoryError, EOFError, SyntaxError, BufferError, ImportError, struct.error, zlib.error, msgspec.MsgspecError),
 )
-COPY_AGAIN = "is it whole, and of the kind its suffix says? copy it again from where it came"
+COPY_AGAIN = "the file may be incomplete, or of another format than its suffix: copy it again from its source"
 MOST_BYTES = 1 << 30  # largest file that is read as a whole
 MOST_WORDS = 200  # longest message of a parser, characters
 KINDS = {
@@ -131,7 +131,7 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     if most_bytes is not None and status.st_size > most_bytes:
         fault = f"has {status.st_size / 1e6:,.1f} MB; {what} has {most_bytes / 1e6:,.1f} MB at most"
-        raise InputError(fault, file=file, key=key, cure="is it the right file?")
+        raise InputError(fault, file=file, key=key, cure="name another file, or make this one smaller")
     return status.st_size
 
 

@@ -100,7 +100,7 @@ def load_result(folder: str | Path) -> Result:
     facts = read_json(file) if file.is_file() else {}
     if not (isinstance(facts, dict) and facts.keys() >= SLICES):
         raise InputError(
-            "the result lacks the facts of its data set", file=file, cure=f"make export DATASET={result.name}"
+            "the result has no facts of its data set", file=file, cure=f"make export DATASET={result.name}"
         )
     files = {path.relative_to(source).as_posix(): path for path in sorted(source.rglob("*")) if path.is_file()}
     return Result(result, SolvedSet(Inputs(folders, facts, files)))

@@ -31,7 +31,7 @@ NOT_ROUND = 0.02  # largest variation of a ball's radius, relative
 
 
 class Validation:
-    """The files of one dataset, each checked once."""
+    """Checker of the files of one dataset, which checks each file once."""
 
     def __init__(self, dataset: Dataset):
         self.dataset = dataset
@@ -63,7 +63,10 @@ class Validation:
         return _faults([*lights, *(partial(read_parts, p) for p in files.values() if p.suffix.lower() in MESHES)])
 
     def cautions(self) -> list[str]:
-        """Return warnings about what no photo can determine, from the materials that dataset.yaml names."""
+        """Warn if the lights fall into groups without a shared material.
+
+        Brightness and colour cannot be compared between such groups.
+        """
         together: dict[str, set[str]] = {}
         for photo in self.spec.photos:
             together.setdefault(photo.light, set()).update(

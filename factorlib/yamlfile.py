@@ -27,13 +27,18 @@ Invalid = tuple[str, Any, list, Keys]  # msgspec's message, the invalid value, i
 MOST_BYTES = 64_000_000
 MOST_VALUES = 2_000_000  # scalars, lists and maps; those that aliases repeat count each time
 MOST_DEPTH = 64  # nesting of lists and maps
-TOO_DEEP = "is a bracket missing, an indent too much, or does an alias (*name) stand inside its anchor (&name)?"
+TOO_DEEP = "look for a missing bracket, a wrong indent, or an alias (*name) inside its anchor (&name)"
 _CORE = re.compile(  # YAML 1.2.2, section 10.3.2; a number of more digits is a float or a word
     r"(?P<null>~|null|Null|NULL|)|(?P<bool>true|True|TRUE|false|False|FALSE)"
     r"|(?P<int>[-+]?[0-9]{1,18}|0o[0-7]{1,20}|0x[0-9a-fA-F]{1,15})"
     r"|(?P<float>[-+]?(?:\.[0-9]{1,300}|[0-9]{1,300}(?:\.[0-9]{0,300})?)(?:[eE][-+]?[0-9]{1,300})?"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
 )
+_NOUNS = {
+    **{int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"},
+    **{list: "a list", tuple: "a list", dict: "a map, key: value"},
+}
+_LIMITS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _FIELD = re.compile(r"(?P<fault>unknown|missing required) field `(?P<name>.*)`", re.DOTALL)
 
 
@@ -115,7 +120,7 @@ def _parse(text: str, name: str | Path, most_values: int) -> tuple[Any, dict[Key
     def plain(node: yaml.Node, keys: Keys) -> Any:
         """Convert a node, and record the lines of what it holds."""
         if next(number) > most_values:
-            cure = "is it the right file? an alias (*name) repeats all that its anchor (&name) holds"
+            cure = "check that it is the right file: an alias (*name) repeats all that its anchor (&name) holds"
             refuse(f"holds more than {most_values:,} values", node, (), cure)
         if len(keys) > MOST_DEPTH:
             refuse(f"lists and maps are nested more than {MOST_DEPTH} deep", node, keys[:4], TOO_DEEP)
@@ -129,10 +134,10 @@ def _parse(text: str, name: str | Path, most_values: int) -> tuple[Any, dict[Key
         values: dict[str, Any] = {}
         for word, item in node.value:
             if not isinstance(word, yaml.ScalarNode):
-                refuse("a key that is not a word", word, keys, "write key: value")
+                refuse("a key is a list or a map, not a word", word, keys, "write key: value")
             below = (*keys, word.value)
             if word.value in values:
-                fault = f"the key {one_line(repr(word.value))} stands here twice, first on line {lines[below]}"
+                fault = f"the key {one_line(repr(word.value))} occurs twice, first on line {lines[below]}"
                 refuse(fault, word, below, "delete or rename one of them")
             lines[below] = word.start_mark.line + 1
             values[word.value] = plain(item, below)
@@ -206,14 +211,33 @@ def _describe(invalid: Invalid) -> tuple[str, str, Keys]:
             return f"the key {name!r} is missing", f"add {name}: …", keys
         known = [f.encode_name for each in types if _is_struct(each) for f in msgspec.structs.fields(each)]
         return f"unknown key {one_line(repr(name))}", did_you_mean(name, known), (*keys, name)
-    choices = [str(word) for each in types if get_origin(each) is Literal for word in get_args(each)]
     described = [meta.description for each in types for meta in getattr(each, "__metadata__", ())]
-    cure = f"write one of {', '.join(choices)}" if choices else "write a value of that kind"
-    cure = next(filter(None, described), cure)
+    cure = next(filter(None, described), None) or _expectation(types)
     if isinstance(value, int | float) and "xpected `str" in message:
         cure = f'put it in quotes: "{one_line(str(value))}"'
     ending = "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
     return f"{message[:1].lower()}{message[1:]}{ending}", cure, keys
+
+
+def _expectation(types: list) -> str:
+    """Return the cure for a value that is of none of the types: what to write.
+
+    >>> _expectation([Annotated[int, msgspec.Meta(ge=12)], int]), _expectation([Literal["auto", "off"]])
+    ('write a whole number of at least 12', 'write one of auto, off')
+    """
+    choices = [str(word) for each in types if get_origin(each) is Literal for word in get_args(each)]
+    nouns: dict[str, str] = {}  # with the limits of each; an `Annotated` type stands before its own type
+    for each in types:
+        kind, *metas = get_args(each) if get_origin(each) is Annotated else (each,)
+        limits = [(word, getattr(meta, name, None)) for meta in metas for name, word in _LIMITS.items()]
+        noun = _NOUNS.get(dict if _is_struct(kind) else get_origin(kind) or kind)
+        if get_origin(kind) is tuple and get_args(kind)[-1:] != (...,):
+            noun = f"a list of {len(get_args(kind))} values"
+        if noun:
+            nouns.setdefault(noun, " and ".join(f"{word} {limit:.10g}" for word, limit in limits if limit is not None))
+    words = [f"{noun} of {limits}" if limits else noun for noun, limits in nouns.items()]
+    words += [f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]] if choices else []
+    return f"write {' or '.join(words) or 'another value'}"
 
 
 def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> list[Invalid]:

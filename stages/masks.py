@@ -145,7 +145,7 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
             f"averaged down {factor} × {factor}, no pixel shows mostly one material: the mask is made of specks",
             file=path,
             key=key,
-            cure='SET="masks.frame=…" with more pixels, or a mask of whole objects',
+            cure='allow more pixels, SET="masks.frame=…", or give a mask of whole objects',
         )
     return Labels(label, left_out)
 

@@ -43,18 +43,18 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
     if depth.max() <= 0 or middle <= 0:
         subject = f"object {name!r}" if depth.max() <= 0 else f"the middle of object {name!r}"
         raise InputError(
-            f"{subject} is not before the camera: z = {middle:.4g}",
+            f"{subject} is behind the camera: z = {middle:.4g}",
             file="dataset.yaml",
             key=f"photos[{photo}].objects[{name}].pose"
             if source == "dataset"
             else f"cameras.{source}: {photo}: {name}",
-            cure="x_cam = R x_object + t with x right, y down, z forward (OpenGL's camera looks along −z: turn y and z "
-            "over); take the object out of photos that do not show it",
+            cure="correct the pose, x_cam = R x_object + t with x right, y down, z forward (negate y and z of an OpenGL "
+            "camera, which looks along −z), or remove the object from this photo",
         )
     if behind := int(np.count_nonzero(depth <= 0)):
         log.warning(
-            "%s: %s: its pose (%s) puts %d of its %d vertices behind the camera, which then stands inside it: is it "
-            "so, and in the mesh's units?",
+            "%s: %s: its pose (%s) puts %d of its %d vertices behind the camera, as if this stood inside the "
+            "object: check the pose, and that its translation is in the mesh's units",
             photo,
             name,
             source,
@@ -79,8 +79,8 @@ def warn_of_materials(
     for k, count in zip(labels.tolist(), counts.tolist()):
         if k not in known:
             log.warning(
-                "%s: material %r has %d pixels in the mask, but no object of the photo has it: they are not used; is a "
-                "label wrong, or is an object, or a part's material, missing in dataset.yaml?",
+                "%s: material %r has %d pixels in the mask, but no object of the photo has it, so they are not used: "
+                "correct the label in the mask, or add the object, or the material of its part, in dataset.yaml",
                 photo,
                 materials[k - 1],
                 count,
@@ -99,8 +99,8 @@ def warn_of_camera(focal: float | None, centre: tuple[float, float], size: tuple
     width, height = size
     if not (0 <= centre[0] <= width and 0 <= centre[1] <= height):
         log.warning(
-            "%s: its principal point (%.6g, %.6g) lies outside the photo of %d × %d pixels: so it is only where the "
-            "photo is cut out of a larger one",
+            "%s: its principal point (%.6g, %.6g) lies outside the photo of %d × %d pixels, as only in a photo "
+            "cropped from a larger one: check that it is in pixels of this photo",
             photo,
             *centre,
             width,
@@ -110,8 +110,8 @@ def warn_of_camera(focal: float | None, centre: tuple[float, float], size: tuple
         field = 2 * float(np.degrees(np.arctan(max(size) / 2 / focal)))
         if not FIELD_DEG[0] <= field <= FIELD_DEG[1]:
             log.warning(
-                "%s: its focal length of %.6g px makes a field of view of %.4g°, which few cameras have: is it in "
-                "pixels of the photo, not in millimetres?",
+                "%s: its focal length of %.6g px makes a field of view of %.4g°, which few cameras have: check "
+                "that it is in pixels of the photo, not in millimetres",
                 photo,
                 focal,
                 field,

@@ -50,7 +50,15 @@ class Keypoints(msgspec.Struct, frozen=True):
 
 
 class ObjectToAlign(msgspec.Struct, frozen=True):
-    """Object to align: its mesh, its mask, and its pose as far as the user or an earlier result gives it."""
+    """Object to align: its mesh, its mask, and its pose as far as the user or an earlier result gives it.
+
+    caster      mesh for ray casting
+    silhouette  mask of the object
+    pose        given pose
+    keypoints   given correspondences, from which the search begins
+    earlier     pose of an earlier result, which is refined
+    scale       factors on the axes of the mesh
+    """
 
     name: str
     caster: Caster
@@ -62,7 +70,7 @@ class ObjectToAlign(msgspec.Struct, frozen=True):
 
 
 class Focal(msgspec.Struct, frozen=True):
-    """Focal length during alignment.
+    """Focal length of the photo at one point of the alignment, as given or as estimated so far.
 
     camera        the photo's camera with it
     prior_sigma   standard deviation of its prior for the next object, log; 0 once it is settled
@@ -192,7 +200,7 @@ def _estimate_object(
 
 
 def keypoint_state(obj: ObjectToAlign, keypoints: Keypoints, view: ObjectView, photo: str) -> PoseState:
-    """Return the state in which most keypoints of `obj` agree.
+    """Estimate the pose of an object from its keypoints.
 
     It is COLMAP's robust absolute pose (LO-RANSAC over P3P, or over P4Pf with an unknown focal length), then refined.
     Wrong keypoints are outliers as long as enough of the others agree.
@@ -264,13 +272,13 @@ def _check_exif_focal(
     if free.score < estimate.score + CLEARLY_BETTER:
         return estimate, "exif"
     log.warning(
-        "%s: the EXIF focal length (%.0f px) does not fit the mask, %.0f px does (%.3f against %.3f): is the photo a "
-        "crop? give camera.focal_px to settle it",
+        "%s: the EXIF focal length (%.0f px) fits the mask worse than %.0f px, which is used (IoU %.3f against %.3f): "
+        "the photo may be a crop; camera.focal_px in dataset.yaml overrides both",
         photo,
         view.camera.focal,
         np.exp(free.state.log_focal),
-        free.score,
         estimate.score,
+        free.score,
     )
     return free, "estimated"
 

@@ -59,7 +59,7 @@ class PoseState(msgspec.Struct, frozen=True):
         return np.exp(self.log_depth) * np.array([self.a, self.b, 1.0])
 
     def pose(self, mesh: Mesh | Caster) -> Pose:
-        """Return cam_from_object of a mesh with this centre."""
+        """Return cam_from_object, the pose that puts the mesh's centre at `middle()`."""
         return Pose(self.rotation, self.middle() - self.rotation @ mesh.centre)
 
     @property
@@ -68,7 +68,7 @@ class PoseState(msgspec.Struct, frozen=True):
         return float(np.exp(self.log_focal))
 
     def camera(self, template: Camera) -> Camera:
-        """Return `template` with this state's focal length."""
+        """Return the camera `template` with this state's focal length."""
         return msgspec.structs.replace(template, focal=self.focal)
 
     def moved(self, step: Float[np.ndarray, "7"]) -> "PoseState":
@@ -117,7 +117,7 @@ def pose_state(pose: Pose, camera: Camera, mesh: Mesh | Caster) -> PoseState:
 
 
 class RefinedState(msgspec.Struct, frozen=True):
-    """State, its labelled IoU in the window, and the information matrix of the normal equations there."""
+    """Refined state, its labelled IoU in the target's window, and the information matrix of its normal equations."""
 
     state: PoseState
     score: float

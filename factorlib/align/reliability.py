@@ -66,7 +66,7 @@ class Reliability(msgspec.Struct, frozen=True):
 
 
 class Thresholds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Thresholds that a pose must reach."""
+    """Thresholds of the measures of a pose, beyond which it is doubtful."""
 
     least_iou: Share = 0.7
     """Least overlap (intersection over union) of mesh and mask; below, the pose is doubtful."""

@@ -122,7 +122,7 @@ class ObjectView(msgspec.Struct, frozen=True):
 
     @property
     def free(self) -> int:
-        """Number of unknowns of `PoseState.moved` that may move; the last one is the focal length."""
+        """Number of free unknowns of `PoseState.moved`: 7, or 6 if the focal length is known."""
         return 7 if self.focal_sigma > 0 else 6
 
     def mirrored(self) -> "ObjectView":
@@ -152,7 +152,7 @@ def with_prior_focal(camera: Camera, focal: float | None, source: str | None) ->
 
 
 class Region(msgspec.Struct, frozen=True):
-    """One material in the photo, in pixels of the window.
+    """Region of one material in a `Target`, in pixels of its window.
 
     distance  [h, w] signed distance to the region's border, negative inside, 0 where unknown
     slope     [h, w, 2] its gradient (x, y)
@@ -167,8 +167,9 @@ class Region(msgspec.Struct, frozen=True):
 
 
 class Target(msgspec.Struct, frozen=True):
-    """Window about the mask of a view.
+    """Part of the photo around an object's mask, resampled, to which poses are fitted.
 
+    view         photo and camera of the object
     left, top    corner of the window in the photo, photo pixels
     pixel        photo pixels per window pixel
     silhouette   the mask in the window

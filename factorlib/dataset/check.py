@@ -132,17 +132,17 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
         mesh.size != 1.0 and kinds[0] in ("file", "hull"),
         f"{key}.size",
         f"cannot be combined with {kinds[0]}",
-        "leave it out: its own numbers say how large it is",
+        "leave it out: the coordinates of the mesh determine its size",
     )
     refuse.when(
         mesh.parts and kinds[0] in ("lathe", "primitive"),
         f"{key}.parts",
         f"cannot be combined with {kinds[0]}, which has one part",
-        "write `material: …`",
+        "write `material: …` instead",
     )
     if mesh.parts and mesh.material is not None:
         refuse(
-            key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material:` for a mesh of one"
+            key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material: …` for all of it"
         )
     if not mesh.parts and mesh.material is None:
         refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
@@ -157,7 +157,7 @@ def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
     refuse.when(
         known < LEAST_OUTLINES,
         f"meshes.{name}.hull",
-        f"of {len(instances)} photos of it {known} have a known camera, a hull needs two",
+        f"{known} of the {len(instances)} photos of it have a known camera; a hull needs at least two",
         "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive",
     )
 
@@ -170,13 +170,13 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
             not mesh.file and not mesh.parts and part != ALL_OF_IT,
             f"{key}.{part}",
             f"it has no part {part!r}",
-            f"it has one, {ALL_OF_IT!r}",
+            f"its only part is {ALL_OF_IT!r}",
         )
         refuse.when(
             file.suffix.lower() in ONE_PART and part != file.stem,
             f"{key}.{part}",
             f"{file.name} has no part {part!r}",
-            f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF",
+            f"its only part is {file.stem!r}; for several parts, save the mesh as OBJ or glTF",
         )
         if mesh.parts:
             refuse.known(f"{key}.{part}", part, mesh.parts, "part")
@@ -301,9 +301,10 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             refuse.known(key, name, [photo.name for photo in spec.photos], "photo")
             sharing = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
             if without := [photo.name for photo in sharing if photo.name not in spec.known.exposure]:
-                refuse(key, f"{without[0]!r} shares its light and has none", "give the EV of every photo of a light")
+                fault = f"photo {without[0]!r} shares the light of this one, but has no exposure"
+                refuse(key, fault, "give the EV of every photo of a light, or of none")
             if len(sharing) == 1:
-                refuse(key, "no other photo shares its light, whose brightness holds it", "leave it out")
+                refuse(key, "no other photo shares its light, so its exposure would have no effect", "leave it out")
     for name, light in spec.known.illumination.items():
         with refuse.collecting():
             key = f"known.illumination.{name}"
@@ -327,12 +328,12 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             if known is None or any(known.diffuse) or not known.specular:
                 cure = (
                     f"write known.materials.{material}: "
-                    "{diffuse: [0, 0, 0], specular: [.55, .55, .55]}, as chrome's is"
+                    "{diffuse: [0, 0, 0], specular: [0.55, 0.55, 0.55]}, as chrome's is"
                 )
                 refuse(key, f"the specular reflectance of {material!r} is not known, or it is not a mirror", cure)
             if len(shots[name]) > 1 and photo.name not in spec.known.exposure:
-                cure = "give known.exposure of its photos, or the light of one photo alone"
-                refuse(key, f"{len(shots[name])} photos of unknown exposures share the light", cure)
+                cure = "give known.exposure of these photos, or give the ball's photo a light of its own"
+                refuse(key, f"{len(shots[name])} photos of unknown exposure share the light of the ball", cure)
 
 
 def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, MeshInstance]]:
@@ -392,7 +393,7 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         first: dict[tuple[float, ...], int] = {}
         for index, place in enumerate(places):
             if (other := first.setdefault(place, index)) != index:
-                refuse(f"{key}[{index}].{name}", f"the same as {key}[{other}]'s", "name each place once")
+                refuse(f"{key}[{index}].{name}", f"equals that of {key}[{other}]", "name each place once")
         # largest distance of a place from the line through the first and the farthest one
         arms = [[x - x0 for x, x0 in zip(place, places[0])] for place in places[1:]]
         longest = max(arms, key=lambda arm: math.hypot(*arm))
@@ -402,8 +403,8 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         refuse.when(
             max(distances) < LEAST_OFF_LINE * math.hypot(*longest),
             key,
-            f"every {name} lies on one line",
-            "name places in different directions: about a line the object could turn",
+            f"each {name} lies on one line",
+            "add a keypoint away from that line, about which the object could rotate",
         )
 
 

@@ -19,7 +19,7 @@ Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 Numbers3 = tuple[float, float, float]
 Numbers4 = tuple[float, float, float, float]
 WHAT = "glTF"
-CURE = "is it whole? export it again, as .glb or .gltf"
+CURE = "the file may be incomplete: export it again, as .glb or .gltf"
 MOST_VALUES = 2_000_000  # values in a header: each becomes an object of some hundred bytes; base64 has no commas
 BEFORE_JSON = 20  # bytes of a .glb before its JSON: its own header, and that of its first chunk
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
@@ -40,7 +40,7 @@ class Buffer(msgspec.Struct, frozen=True):
 
 
 class Accessor(msgspec.Struct, frozen=True):
-    """An array of `count` elements; `normalized` integers stand for fractions, and `sparse` ones differ from a base."""
+    """An array of `count` elements; `normalized`: integers stand for fractions; `sparse`: the elements that differ."""
 
     count: Count
     normalized: bool = False
@@ -135,7 +135,7 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
         if file.suffix.lower() == ".glb":
             magic, version, _, length, kind = struct.unpack("<4sIII4s", stream.read(BEFORE_JSON))
             if magic != b"glTF" or version != 2 or kind != b"JSON":
-                raise ValueError("it does not begin as a .glb of version 2 does")
+                raise ValueError("it does not begin with the header of a .glb of version 2")
             if length > size - BEFORE_JSON:
                 raise ValueError("its first chunk is longer than the file")
         text = stream.read(size if length is None else length)
@@ -165,5 +165,5 @@ def buffer_path(uri: str) -> str | None:
     if uri.startswith("data:"):
         return None
     if SCHEME.match(uri):
-        raise ValueError(f"names {uri[:80]!r}, which is no file beside it")
+        raise ValueError(f"refers to {uri[:80]!r}, which is not a local file")
     return str(PurePosixPath(unquote(uri).replace("\\", "/")))

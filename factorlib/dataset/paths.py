@@ -17,7 +17,7 @@ ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1, which matrices typed 
 
 
 class Refusal:
-    """The file that is being checked; called, it raises InputError for a key, and so do its methods.
+    """Checker of the keys of one file: calling it, or a method, raises InputError for a key.
 
     Attributes:
         file: the file, for errors
@@ -48,7 +48,7 @@ class Refusal:
 
     @contextmanager
     def collecting(self) -> Iterator[None]:
-        """Collect an InputError raised within in `faults`, so that checking continues."""
+        """Catch an InputError of the code inside and add it to `faults`, so that checking continues."""
         try:
             yield
         except InputError as error:

@@ -47,7 +47,7 @@ class _Format(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeshEntry(_Format, frozen=True):
-    """A mesh of several parts, or of one material.
+    """A mesh in dataset.yaml: its file, or the kind of shape to estimate, and the materials of its parts.
 
     A part is an OBJ group or usemtl, or a glTF primitive or material.  Exactly one of file, hull, lathe and primitive
     is given.
@@ -111,8 +111,12 @@ class MeshInstance(_Format, frozen=True):
     """One instance of a mesh in a photo.
 
     Attributes:
+        name: name of the object
+        mesh: name of its mesh
         materials: overrides the materials of the mesh's parts
         mask: the instance's own silhouette
+        pose: its pose, if it is known
+        keypoints: places from which the search for the pose begins
     """
 
     name: Name
@@ -137,11 +141,17 @@ class GroundEntry(_Format, frozen=True):
 
 
 class PhotoEntry(_Format, frozen=True):
-    """One photo.
+    """A photo in dataset.yaml, with its masks, light, camera and objects.
 
     Attributes:
+        image: path of its file
+        masks: a label PNG, a COCO json, or a PNG by material
+        encoding: encoding of the values; None is that of the file's format
         illumination: name of its light; by default the photo's name
         world_from_camera: rotation that fixes its light to the world
+        camera: known intrinsics
+        objects: meshes that the photo shows
+        ground: plane on which the objects stand, if it is known
     """
 
     name: Name
@@ -310,7 +320,7 @@ class ObjectMask(msgspec.Struct, frozen=True):
 
 
 class PhotoSlice(msgspec.Struct, frozen=True):
-    """Slice for reading a photo and its masks.
+    """Facts that the stage `masks` needs to read a photo and its masks.
 
     Attributes:
         camera: only for a lens with distortion
@@ -326,7 +336,7 @@ class PhotoSlice(msgspec.Struct, frozen=True):
 
 
 class ObjectsSlice(msgspec.Struct, frozen=True):
-    """Slice for placing meshes over a photo: its camera, its objects, their meshes, and the external camera."""
+    """Facts about the objects of a photo: their meshes, its camera, and its camera from a source of cameras."""
 
     camera: Intrinsics
     objects: list[MeshInstance]
@@ -335,7 +345,7 @@ class ObjectsSlice(msgspec.Struct, frozen=True):
 
 
 class ShapesSlice(msgspec.Struct, frozen=True):
-    """Slice for estimating cameras and shapes from masks: the meshes without a file, and the photos with their objects.
+    """Facts for estimating cameras and shapes from masks: the meshes without a file, and the photos with their objects.
 
     Attributes:
         sfm: True if cameras are estimated from the photos
@@ -376,7 +386,7 @@ class KnownSlice(msgspec.Struct, frozen=True):
 
 
 class SetSlice(msgspec.Struct, frozen=True):
-    """The set as a whole, in the order of dataset.yaml."""
+    """Names, materials, meshes and photos of the set, in the order of dataset.yaml."""
 
     name: str
     materials: list[str]

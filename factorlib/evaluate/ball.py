@@ -50,7 +50,7 @@ class OctahedralLight(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def wide(self) -> Float[np.ndarray, "t 3"]:
-        """The level of `WIDE_SIDE`, row by row: texels of equal solid angle about 3° across."""
+        """The texels of the level `WIDE_SIDE` texels wide, row by row, each about 3° across."""
         return self.levels[(SIDE // WIDE_SIDE).bit_length() - 1].reshape(-1, 3)
 
 
@@ -114,15 +114,15 @@ def texel_weights(
 
 
 def diffuse_lobe(normals: Float[np.ndarray, "n 3"]) -> Reflected:
-    """Return the radiance E(n)/π that a white Lambertian surface reflects, as a function of the light."""
+    """Return a function of a light: the radiance E(n)/π of a white Lambertian surface at each normal."""
     cosine = np.maximum(normals.astype(np.float32) @ octahedral_directions(WIDE_SIDE).T.astype(np.float32), 0)
     return partial(_summed, cosine / np.float32(np.pi))
 
 
 def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> Reflected:
-    """Return the radiance that GGX with k_s = 1 reflects toward `VIEW`, as a function of the light.
+    """Return a function of a light: the radiance toward `VIEW` of GGX with k_s = 1 at each normal.
 
-    Most of the work does not depend on the light and is done once.
+    The part that does not depend on the light, most of the work, is computed here.
     """
     alpha = max(float(roughness**2), 1e-3)
     return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(normals, alpha)
@@ -170,7 +170,7 @@ def mirror_ball(light: OctahedralLight, normals: Float[np.ndarray, "n 3"], size:
 
 
 def ball(light: OctahedralLight, material: Reflectance, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the reflected radiance of k_d/π + k_s · D G / (4 (n·i)(n·o)) in a light.
+    """Return the radiance of a ball in a light, with the BRDF k_d/π + k_s · D G / (4 (n·i)(n·o)).
 
     Args:
         light: the light

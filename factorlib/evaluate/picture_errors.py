@@ -103,7 +103,7 @@ def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
 def picture_errors(
     estimate: Picture, truth: Picture, regions: dict[str, Mask], white: float
 ) -> dict[str, PictureError]:
-    """Return the errors of each region; empty regions are left out.
+    """Return the errors of a picture in each region; empty regions are left out.
 
     Args:
         estimate: linear radiance
@@ -132,7 +132,7 @@ def picture_errors(
 
 
 def picture_error(estimate: Picture, truth: Picture, mask: Mask, white: float) -> PictureError:
-    """Return the errors inside one mask.
+    """Return the errors of a picture inside one mask.
 
     Args:
         estimate: linear radiance
@@ -184,7 +184,7 @@ class ComparedPhoto(msgspec.Struct, frozen=True):
 
 
 def compared_photo(photo: Channels, geometry: Channels, resynthesis: Picture) -> ComparedPhoto:
-    """Combine a photo with its re-synthesis.
+    """Return a photo with its re-synthesis, the mask of the pixels that count, and the numbers of the others.
 
     Args:
         photo: channels of the stage `masks`
@@ -229,7 +229,7 @@ def agreeing_pixels(photo: Channels, geometry: Channels) -> Bool[np.ndarray, "h 
 def compare_photos(
     names: Iterable[str], materials: list[str], read: Callable[[str], ComparedPhoto]
 ) -> ResynthesisErrors:
-    """Return the errors of all photos.
+    """Compare each re-synthesis with its photo: errors by photo, their means, and the worst PSNR.
 
     Only one photo is in memory at a time, apart from the samples of the counted pixels.
 

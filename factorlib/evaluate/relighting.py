@@ -75,15 +75,15 @@ MEAN_SHOWN = 0.5  # mean of the true ball in the relit set score, linear, before
 
 @lru_cache(maxsize=17)
 def lobe_of(roughness: float | None) -> Reflected:
-    """Return the glossy lobe of a ball, or the diffuse one for None, cached because materials appear in many lights.
+    """Return the glossy lobe of a ball of some roughness, or the diffuse lobe for None.
 
-    They take 200 MB at most.
+    Lobes are cached, up to 200 MB, because materials appear in many lights.
     """
     return diffuse_lobe(NORMALS) if roughness is None else glossy_lobe(NORMALS, roughness)
 
 
 class Appearances:
-    """Balls of many materials in one light, with each part of the reflection rendered once."""
+    """Balls of many materials in one light; each part of the reflection is rendered once."""
 
     def __init__(self, light: OctahedralLight):
         self.diffuse = lobe_of(None)(light)
@@ -99,7 +99,7 @@ class Appearances:
 
 @lru_cache(maxsize=64)
 def appearances(light: OctahedralLight) -> Appearances:
-    """Return the balls in a light, cached because several scores use them."""
+    """Return the `Appearances` of a light, cached because several scores use them."""
     return Appearances(light)
 
 
@@ -188,7 +188,7 @@ def compare_relit_set(
 
 
 def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
-    """Return the factor on the recovered reflectances, from pairs of (recovered, true) materials.
+    """Return the factor per channel from recovered to true reflectances, given (recovered, true) pairs of materials.
 
     >>> true = Reflectance((0.4, 0.4, 0.1), (0.2, 0.1, 0.0), 0.3)
     >>> set_factor([(Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3), true)])
@@ -221,7 +221,7 @@ VIEWS: dict[str, Callable[[OctahedralLight], Samples]] = {
 
 
 def light_error(estimate: Samples, truth: Samples) -> LightError:
-    """Return the errors of samples that stand for equal areas.
+    """Return the errors of samples of a light, all of the same weight.
 
     >>> light_error(np.full((4, 3), 2.0), np.ones((4, 3)))
     LightError(rmse=1.0, rmse_scale_invariant=0.0, rgb_angle_deg=0.0)

@@ -66,7 +66,7 @@ def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.
             f"has no channel {missing[0]}, only {', '.join(channels)}",
             file=path,
             key=key,
-            cure="normals are normal.x, normal.y, normal.z, or R, G, B",
+            cure="write the normals as channels normal.x, normal.y, normal.z, or R, G, B",
         )
     normals = np.stack([channels[channel] for channel in names], axis=-1)
     if normals.shape[1::-1] != tuple(size):
@@ -77,7 +77,7 @@ def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.
             cure="render them with the photo's own pixels",
         )
     if np.isinf(normals).any():
-        raise InputError("a normal is infinite", file=path, key=key, cure="write 0 where there is none")
+        raise InputError("a normal is infinite", file=path, key=key, cure="write 0 where the normal is unknown")
     return normals
 
 

@@ -43,7 +43,7 @@ LEAST_SHARE = 0.2  # least share of e² for a term to be a reason
 
 
 def ball_changes(materials: Mapping[str, Solved], lights: Mapping[str, OctahedralLight]) -> dict[str, float]:
-    """Return m² of each material, mean over lights.
+    """Return m² of (1) for each material, by which its standard errors change its ball, mean over lights.
 
     Both arguments are in one gauge, and the materials have standard errors.
     """
@@ -73,7 +73,7 @@ def _others(solved: Solved) -> Iterator[Reflectance]:
 
 
 class VerdictInputs(msgspec.Struct, frozen=True):
-    """The measured quantities of (1).
+    """Measured quantities from which (1) predicts the score.
 
     Attributes:
         materials: m² of each material that a photo shows (`ball_changes`)
@@ -90,7 +90,7 @@ class VerdictInputs(msgspec.Struct, frozen=True):
     deviation: float = 1.0
 
     def terms(self) -> dict[str, float]:
-        """Return the terms of (1) except the first."""
+        """Return the four measured terms of (1) by name, all but FLOOR."""
         contours = [error for errors in self.contours.values() for error in errors.values()]
         return {
             "materials": MATERIALS * float(np.mean(list(self.materials.values()))),

@@ -18,7 +18,9 @@ from factorlib.tracing.scene import paint, rigid
 
 
 class MeshFiles:
-    """Meshes with their refined surfaces, each read once and written once per choice of materials, split by material.
+    """Writer of the meshes of a set, with their refined surfaces, as a file per material.
+
+    A mesh is read once, and written once for each choice of its materials.
 
     Attributes:
         inputs: the data set's meshes, and the folder of the stage `surface`

@@ -37,7 +37,8 @@ Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .e
 def writes_set(options: Callable[..., tuple[ModuleType, msgspec.Struct]]) -> Callable[..., None]:
     """Return the command that writes a set, with --seed, --out and --lights beside its own options.
 
-    `options` returns the set's module and its options from the command's own ones, which need another folder.
+    `options` takes the options of one command and returns the module of its set and the set's options.  The command
+    demands --out if one of them is given, because data/<set> has none.
     """
 
     def command(seed: Seed = 0, out: Out = None, lights: Lights = None, **values: bool | str | None) -> None:

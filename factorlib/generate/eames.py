@@ -32,7 +32,7 @@ Maps = Sequence[Path]
 
 
 class ChairSetOptions(msgspec.Struct, frozen=True):
-    """ChairSetOptions of the set.
+    """Options of the chair set.
 
     width, height    size of photos, pixels
     light_rows       rows of light maps
@@ -103,7 +103,7 @@ def generate(
         out: Empty folder.
         seed: Seed; 0 is the set in the repository.
         lat_longs: Light maps of the user, which replace the generated lights.
-        parameters: ChairSetOptions of the set.
+        parameters: Options of the set.
         progress: Function of the number of photos that are done, of their total, and of the current photo's name.
         shots: Photos.
     """
@@ -165,7 +165,7 @@ def arrange_scene(
         lat_longs: Light maps of the user.
         rng: Random generator.
         spread: Size of the random changes of chairs' rotations and camera position, from 0 to 1.
-        parameters: ChairSetOptions of the set.
+        parameters: Options of the set.
 
     Returns:
         The scene.

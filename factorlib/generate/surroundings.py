@@ -194,7 +194,9 @@ def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     radiance = read_light_map(path)
     if (rows := len(radiance)) % height:
         raise InputError(
-            f"{rows} rows do not divide into {height}", file=path, cure=f"resize it to a multiple of {height} rows"
+            f"its {rows} rows are not a multiple of {height}",
+            file=path,
+            cure=f"resize it to a multiple of {height} rows",
         )
     radiance = radiance.reshape(height, rows // height, 2 * height, rows // height, 3).mean(axis=(1, 3))
     return radiance / radiance.mean()

@@ -130,7 +130,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Synthe
         out: Empty folder.
         seed: Seed; 0 is the set in the repository.
         lat_longs: Light maps of the user, which replace the generated lights.
-        parameters: SyntheticOptions of the set.
+        parameters: Options of the set.
         progress: Function of the number of steps that are done, of their total, and of the current step.
     """
     for name in ("photos", "masks", "meshes", "truth"):
@@ -220,7 +220,7 @@ def write_shot(out: Path, scene: SyntheticScene, parameters: SyntheticOptions, s
     Args:
         out: Folder of the data set.
         scene: The scene.
-        parameters: SyntheticOptions of the set.
+        parameters: Options of the set.
         seed: Seed of the renderer.
 
     Returns:

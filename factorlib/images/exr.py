@@ -110,14 +110,14 @@ def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:
         raise InputError(
             f"not readable as an image ({oiio.geterror()})",
             file=path,
-            cure="the file is damaged or not an EXR: restore or export it again",
+            cure="the file is damaged or not an EXR: copy or export it again",
         )
     names = list(source.spec().channelnames)
     pixels = source.read_image(oiio.FLOAT)
     error = source.geterror()
     source.close()
     if pixels is None:
-        raise InputError(f"truncated or damaged ({error})", file=path, cure="restore the file")
+        raise InputError(f"truncated or damaged ({error})", file=path, cure="copy it again from its source")
     return {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate(names)}
 
 
@@ -127,6 +127,8 @@ def read_rgb_exr(path: str | Path) -> Float[np.ndarray, "h w 3"]:
     for name in "RGB":
         if name not in channels:
             raise InputError(
-                f"has no channel {name}, only {', '.join(channels)}", file=path, cure="an RGB image is expected"
+                f"has no channel {name}, only {', '.join(channels)}",
+                file=path,
+                cure="save it as an RGB image, with channels R, G and B",
             )
     return np.stack([channels[name] for name in "RGB"], axis=-1)

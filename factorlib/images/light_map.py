@@ -15,7 +15,6 @@ MOST_TEXELS = 4096 * 2048  # they take 250 MB when read, and more in a renderer
 LEAST = -1e-3  # least radiance, in units of the mean magnitude: resampling leaves small negative values
 LARGEST = 1e15  # greatest radiance: the sun's disc is 1e9 times as bright as a room
 SUFFIXES = (".hdr", ".exr")
-CURE = "correct or remove this map"
 
 
 def maps_in(folders: Sequence[Path]) -> list[Path]:
@@ -27,13 +26,13 @@ def maps_in(folders: Sequence[Path]) -> list[Path]:
     paths = []
     for folder in folders:
         if not folder.is_dir():
-            raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
+            raise InputError("there is no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
         maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not maps:
             raise InputError(
                 "no .hdr or .exr in this folder",
                 file=folder,
-                cure="name a folder of lat-long maps; folders within it count by themselves",
+                cure="name a folder that directly holds lat-long maps; its subfolders are not searched",
             )
         paths += maps
     return paths
@@ -58,8 +57,8 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     opened = open_photo(path, key)
     height, width = opened.size
     if width != 2 * height:
-        fault = f"{width} × {height} pixels is no lat-long map"
-        raise InputError(fault, file=path, key=key, cure="its width must be twice its height")
+        fault = f"has {width} × {height} pixels; a lat-long map is twice as wide as high"
+        raise InputError(fault, file=path, key=key, cure="name a lat-long map, or convert this one")
     least = np.inf
     total = 0.0
     lost = 0
@@ -77,11 +76,13 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     factor = next((divisor for divisor in range(factor, 2 * factor) if height % divisor == 0), factor)
     radiance = decoded(opened, "linear", factor, path, look).radiance
     if lost:
-        fault = f"{lost} pixels are no numbers, or infinite (more than {LARGEST:g})"
-        raise InputError(fault, file=path, key=key, cure=CURE)
+        fault = f"{lost} pixels are NaN, infinite or above {LARGEST:g}"
+        raise InputError(fault, file=path, key=key, cure="replace these pixels, or export the map again")
     if least < LEAST * total / (3 * height * width):
-        cure = "give linear radiance: was a filter with negative lobes used? cut it at 0"
-        raise InputError(f"a radiance of {least:.4g} is less than 0", file=path, key=key, cure=cure)
+        cure = (
+            "set negative values, which some resampling filters make, to 0, or export the map again as linear radiance"
+        )
+        raise InputError(f"has a radiance of {least:.4g}, less than 0", file=path, key=key, cure=cure)
     if not (radiance > 0).any():
-        raise InputError("the map is black", file=path, key=key, cure=CURE)
+        raise InputError("the map is black", file=path, key=key, cure="name another map, or export this one again")
     return radiance.astype(float)

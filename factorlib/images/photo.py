@@ -115,7 +115,7 @@ def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path,
             "every pixel in its mask is black, or less than 0",
             file=path,
             key=key,
-            cure="expose, render or develop it again; was the exposure 0, or a sign turned? or drop the photo",
+            cure="expose, render or develop it again (its exposure or a sign may be wrong), or remove the photo",
         )
 
 

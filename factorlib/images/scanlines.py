@@ -27,7 +27,7 @@ from factorlib.reading import one_line
 
 CLIPPED = 0.995  # least share of the white code that is clipped: JPEG compression disturbs the top code a little
 WHITE = {oiio.UINT8: 2**8 - 1, oiio.UINT16: 2**16 - 1, oiio.UINT32: 2**32 - 1}
-COPY = "copy it again from where it came"
+COPY = "copy it again from its source"
 log = logging.getLogger("factorlib.images")
 MOST_MEGAPIXELS = 200.0  # twice the number of the largest sensors
 CHANNELS = 4  # greatest number of channels of an ordinary photo
@@ -132,7 +132,10 @@ def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[in
     colours = [index for index in range(len(names)) if index != spec.alpha_channel and names[index] != "Z"]
     if len(colours) != 1:
         raise InputError(
-            f"has the channels {', '.join(names)}", file=path, key=key, cure="save it as RGB or grey, in one layer"
+            f"has the channels {', '.join(names)}: neither grey nor RGB",
+            file=path,
+            key=key,
+            cure="save it as RGB or grey, in one layer",
         )
     return 3 * colours
 
@@ -166,7 +169,7 @@ def check_pixels(size: tuple[int, int], most_megapixels: float, path: str | Path
 
 
 def check_values(path: str | Path, most_megapixels: float = MOST_MEGAPIXELS, key: str | None = None) -> None:
-    """Check the number of values of an image file against that of a photo with CHANNELS channels.
+    """Check that an image file has at most as many values as the largest photo has with CHANNELS channels.
 
     A file that is no image, or of a kind that OpenImageIO does not read, passes: its reader rejects it.
 

@@ -88,7 +88,7 @@ class Fit(msgspec.Struct, frozen=True):
 
 
 class FitSchedule(msgspec.Struct, frozen=True):
-    """Number of steps of a fit.
+    """Schedule of a fit: its descents, their steps, and when hyperparameters are estimated.
 
     Attributes:
         light_steps: Steps of the lights alone, materials given, before the others.
@@ -262,5 +262,5 @@ def reliable_mask(block: Block) -> Bool[np.ndarray, " n"]:
 
 
 def initial_fit(point: Point) -> Fit:
-    """Return the fit of a point before any descent."""
+    """Return a point as the start of a fit, with the initial hyperparameters."""
     return Fit(point, [Hyperparameters() for _ in point.lights])

@@ -196,8 +196,8 @@ class FitRunner:
         """Return the state after all steps; steps that an earlier run completed are read.
 
         Args:
-            steps: Steps by name, each a function of the question and the state.
-            request: Question.
+            steps: Steps by name, each a function of the request and the state.
+            request: Input of the solve that all steps share.
             state: Initial state.
         """
         for name, step in steps.items():

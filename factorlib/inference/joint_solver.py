@@ -42,7 +42,7 @@ LIGHTS = FitSchedule(descents=(0, 2, 2), least_temperature=0.1, materials_fixed=
 
 
 class SolveRequest(msgspec.Struct, frozen=True):
-    """Question that a solve answers.
+    """Input of a joint solve: the problem, its initial fits, the options and the runner.
 
     Attributes:
         problem: All observations; its loss judges the held-out ones.
@@ -94,25 +94,25 @@ def initial_fits(problem: JointProblem, start: Start, options: SolveOptions) -> 
 
 
 def choose_effects(request: SolveRequest, state: SolveState) -> SolveState:
-    """Choose shadows and interreflection."""
+    """Choose by held-out observations whether shadows are modelled, and by evidence whether interreflection is."""
     problem = reliable_observations(request.problem)
     return select_effects(problem, request.starts, request.options, request.run.fit)
 
 
 def choose_tone(request: SolveRequest, state: SolveState) -> SolveState:
-    """Choose tone curves."""
+    """Choose by held-out observations which lights get tone curves, and fit them."""
     chosen = select_tone_curves(request.reliable_problem(state), state.fit, request.options, request.run.fit)
     return state.with_fit(chosen.fit, tone=chosen.evidence)
 
 
 def choose_distances(request: SolveRequest, state: SolveState) -> SolveState:
-    """Choose distances of lights."""
+    """Choose by marginal likelihood which lights are at a finite distance, and fit their distances."""
     chosen = select_distances(request.reliable_problem(state), state.fit, request.options, request.run.fit)
     return state.with_fit(chosen.fit, distances=chosen.evidence)
 
 
 def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
-    """Fit materials and lights on all cells."""
+    """Fit materials and lights of `SolveOptions.cells` cells to observations with reliable normals."""
     sample = request.reliable_problem(state).subsample(request.options.observations, request.options.seed)
     start_fit = refine_cells(state.fit, request.options.cells, sample)
     fit = request.run.fit_and_report("materials and lights", sample, start_fit, MATERIALS)
@@ -120,18 +120,18 @@ def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
 
 
 def choose_splittings(request: SolveRequest, state: SolveState) -> SolveState:
-    """Split the cells with most energy while the marginal likelihood rises."""
+    """Split the brightest cells of the lights while that raises their marginal likelihoods, and fit anew."""
     return split_cells(request.reliable_problem(state), state, request.options, request.run)
 
 
 def fit_lights(request: SolveRequest, state: SolveState) -> SolveState:
-    """Fit lights to observations of any confidence, materials given."""
+    """Fit the lights to observations of any confidence, with the materials fixed."""
     fit = request.run.fit_and_report("lights", request.light_problem(state), state.fit, LIGHTS)
     return msgspec.structs.replace(state, fit=fit)
 
 
 def choose_suns(request: SolveRequest, state: SolveState) -> SolveState:
-    """Choose suns, materials given."""
+    """Replace the brightest cells of a light by a sun where that explains its observations better."""
     chosen = select_suns(request.light_problem(state), state.fit, request.run)
     return msgspec.structs.replace(state, fit=chosen.fit, suns=chosen.evidence)
 

@@ -211,7 +211,7 @@ def extract_known(
                 f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
                 f"and {(of_photo & beside_ball).sum()} observations of other objects"
             )
-            cure = f"the ball needs {LEAST_BALL_PIXELS}, and something beside it: look at the overlay of `align`"
+            cure = f"the ball needs {LEAST_BALL_PIXELS}, and its photo other objects: check mask and pose of the ball in the overlay of `align`"
             raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
         world = photos[ball.photo].world_from_camera
         lights[name] = light_from_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
@@ -231,7 +231,7 @@ def _known_rows(declared: KnownSlice, observations: Observations) -> dict[str, F
     rows = {}
     for name, known in declared.materials.items():
         if not (observations.material == list(observations.materials).index(name)).any():
-            cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
+            cure = "check in the overlays of `align` that mask and mesh show it in the same pixels"
             raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
         roughness = known.roughness or (ROUGHNESS[0] if name in chrome else np.nan)
         rows[name] = np.array([*known.diffuse, *(known.specular or (np.nan,) * 3), roughness])

@@ -234,7 +234,7 @@ class Light(msgspec.Struct, frozen=True):
     def tone_slope(
         self, radiance: Float[np.ndarray, "n c"], photo: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n c"] | float:
-        """Return the derivative of the observed by the linear radiance, where the observed one is `radiance`."""
+        """Return the slope of each observation's tone curve where the curve's value is `radiance`."""
         if len(self.log_tone) == 0:
             return 1.0
         g = self.exponents(photo)

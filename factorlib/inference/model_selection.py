@@ -127,7 +127,7 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Fit after a choice, and the evidence for each light or each splitting."""
+    """Result of a model comparison: fit of the chosen model, and one decision per light (or per splitting)."""
 
     fit: Fit
     evidence: list[Decision]
@@ -139,12 +139,12 @@ def relative_gain(decision: Decision) -> float:
 
 
 def comparison_sample(problem: JointProblem, options: SolveOptions) -> JointProblem:
-    """Return the observations on which models are compared."""
+    """Return the subsample of observations on which models are fitted and compared."""
     return problem.subsample(min(TRIAL_OBSERVATIONS, options.observations), options.seed)
 
 
 def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptions, run_fit: Fitting) -> SolveState:
-    """Choose shadows and interreflection.
+    """Choose shadows by held-out observations, and interreflection by marginal likelihood.
 
     Args:
         problem: Observations with reliable normals.
@@ -182,7 +182,9 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
 
 
 def select_interreflection(sample: JointProblem, start: Fit, run_fit: Fitting) -> Selection:
-    """Choose interreflection: both models continue from the same fit, under its hyperparameters.
+    """Choose interreflection by the marginal likelihoods of two fits, with and without it, from one start.
+
+    Both have the hyperparameters of the start.
 
     Args:
         sample: Observations on which models are compared.
@@ -209,11 +211,11 @@ def _log_geometric_mean(losses: Losses) -> float:
 
 
 def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
-    """Choose tone curves.
+    """Choose by held-out observations which lights get tone curves, and fit them.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
-        start: Fit of few of them.
+        start: Fit to the comparison sample.
         options: Options of the user.
         run_fit: Function that fits a model.
     """
@@ -244,13 +246,13 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
 def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
     """Choose distances of lights by their marginal likelihoods.
 
-    Materials and all lights are fitted at infinity and at each of `CURVATURES`: those fitted in far lights make up for
-    errors of these.  But materials that are better in near lights explain every light better.  So each light is
+    Materials and all lights are fitted at infinity and at each of `CURVATURES`, because materials that were fitted in
+    far lights compensate for these.  But materials fitted in near lights explain every light better.  So each light is
     compared once more, given the materials of the near lights, and the smaller Bayes factor counts.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
-        before: Fit of few of them.
+        before: Fit to the comparison sample.
         options: Options of the user.
         run_fit: Function that fits a model.
     """

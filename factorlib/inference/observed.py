@@ -49,11 +49,11 @@ def gather_observations(
     surface: Path | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> list[PhotoObservations]:
-    """Read each file in order, and merge its observations within `degrees` of each other (`factorlib.urm.reduction`).
+    """Read each file in order, and merge observations of one material with similar normals and mirror directions.
 
     Args:
         files: Files of `urm`.
-        degrees: Largest angle between merged observations.
+        degrees: Size of the cells of normals and mirror directions (`factorlib.urm.reduction`); 0 merges nothing.
         spread: Map over independent work.
         surface: Folder of the stage `surface`, whose normals replace those of the mesh; None for the mesh's.
         tick: Called after each file.
@@ -92,12 +92,12 @@ def blocks_of_observations(
     usable = usable_observations(observations)
     if len(usable) == 0:
         raise InputError(
-            "no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap"
+            "no valid observation in any photo", cure="check in the overlays of `align` that masks and meshes overlap"
         )
     if (usable.radiance <= 0).all():
         raise InputError(
             "every observation is black",
-            cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks",
+            cure="check the exposure and `encoding` of the photos, and that the masks lie on the objects",
         )
     block = partial(_block, noise=noise, share=held_out, rotations=world_from_camera or {}, seed=seed)
     rows_by_light = [np.flatnonzero(usable.illumination == i) for i in range(len(usable.illuminations))]

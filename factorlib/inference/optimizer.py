@@ -146,7 +146,10 @@ class Descent(msgspec.Struct, frozen=True):
     def descend_lights(
         self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"], iterations: int
     ) -> DescentState:
-        """Return the state after at most `iterations` steps of each light, materials given, one factorisation each."""
+        """Descend each light by itself with the materials fixed.
+
+        A light gets at most `iterations` minimisations by L-BFGS, each preconditioned by one factorisation of H.
+        """
         fitted = list(self.spread(lambda likelihood: descend_light(likelihood, iterations), likelihoods))
         return self._state(theta, [likelihood for likelihood, _ in fitted], [system for _, system in fitted])
 
@@ -237,7 +240,10 @@ def pushed_outward(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
 
 
 def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
-    """Return a light at the minimum of φ, materials given, and its normal equations there."""
+    """Minimise φ over one light with the materials fixed; return its likelihood and normal equations at the minimum.
+
+    There are at most `iterations` minimisations by L-BFGS, each preconditioned by one factorisation of H.
+    """
     system = likelihood.normal_equations(materials_given=True)
     for _ in range(iterations):
 

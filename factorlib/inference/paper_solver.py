@@ -155,7 +155,10 @@ def take_step(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, fl
 
 
 def first_metric(slope: Tensor, pairs: Pairs) -> Tensor:
-    """Return a vector at the scale of the last pair, or at a tenth of its own size without one."""
+    """Return a gradient times the initial inverse Hessian of L-BFGS, a number from the last pair.
+
+    Without a pair, the product is scaled to a largest entry of 0.1.
+    """
     if not pairs:
         return 0.1 * slope / max(float(slope.abs().max()), 1e-30)
     step, change = pairs[-1]
@@ -275,7 +278,7 @@ class UnitReflection(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, diffuse: Tensor, specular: Tensor) -> tuple[Tensor | None, ...]:
-        """Return gradients by roughness, log sharpness, n·z and o·z; n·o is fixed and has none."""
+        """Return the gradients with respect to roughness, log sharpness, n·z and o·z; n·o is constant."""
         by_roughness, d_by_sharpness, s_by_sharpness, d_by_nz, s_by_nz, s_by_oz = ctx.saved_tensors
         by_sharpness = (diffuse * d_by_sharpness + specular * s_by_sharpness).sum(0)
         by_nz = diffuse * d_by_nz + specular * s_by_nz

@@ -28,7 +28,7 @@ Spread = Callable[[Callable, Iterable], Iterable]  # an ordered map over indepen
 
 
 class JointProblem(msgspec.Struct, frozen=True):
-    """Given part of the joint problem.
+    """Joint problem: observations, reflection operator and known values, by which any point is evaluated.
 
     Attributes:
         blocks: Observations by illumination.

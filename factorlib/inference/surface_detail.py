@@ -131,7 +131,15 @@ def decide_detail(scores: PhotoScores, reference: PhotoScores, held_out: float, 
 
 
 class DetailTrial(msgspec.Struct, frozen=True):
-    """Problem without detail, its fit, and the attachment of its blocks to the surface."""
+    """Baseline of a search for surface detail: the problem on the bare meshes, its fit, and where observations lie.
+
+    Attributes:
+        problem: Observations, without detail.
+        fit: Fit to them.
+        surfaces: Subdivided meshes.
+        attached: Mesh nodes of each observation, by block.
+        prior: Prior on lights.
+    """
 
     problem: JointProblem
     fit: Fit
@@ -159,7 +167,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
 
     @property
     def photos(self) -> list[tuple[int, int]]:
-        """Photos with observations, each as its block and its number there."""
+        """Photos with observations, each as the number of its block and its number in that block."""
         return [(k, int(j)) for k, block in enumerate(self.problem.blocks) for j in np.unique(block.photo)]
 
     @property
@@ -178,13 +186,13 @@ class DetailTrial(msgspec.Struct, frozen=True):
 
     @property
     def names(self) -> list[str]:
-        """Names of these photos."""
+        """Names of the photos with observations, in the order of `photos`."""
         return [self.problem.blocks[k].photos[j] for k, j in self.photos]
 
     def score_photos(
         self, details: Sequence[Detail], tick: Tick = lambda: None, plain: PhotoScores | None = None
     ) -> PhotoScores:
-        """Score every photo by itself: on its own detail, in its own light, with the materials given.
+        """Score every photo by itself, on the detail for it, in a light that is fitted to it, with the materials fixed.
 
         Args:
             details: Detail for each photo, estimated from other photos.
@@ -227,9 +235,9 @@ class DetailTrial(msgspec.Struct, frozen=True):
         movable: Bool[np.ndarray, " v"],
         tick: Tick,
     ) -> list[Detail]:
-        """Return a surface for every photo, estimated from other photos.
+        """Return the surface detail for every photo, estimated from other photos.
 
-        Photos are split into at most `FOLDS` folds, and each photo gets the surface of the other folds.
+        Photos are split into at most `FOLDS` folds; the detail for a photo is estimated from all other folds.
 
         Args:
             parts: Linearised lights on the mesh itself.
@@ -448,7 +456,7 @@ def fit_trial(
 
 
 class ProgressSections(msgspec.Struct, frozen=True):
-    """Report of a search, in units of work."""
+    """Progress report of a search, divided into sections of equal units of work."""
 
     report: ProgressReport
 

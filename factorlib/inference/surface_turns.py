@@ -78,7 +78,7 @@ class Attached(msgspec.Struct, frozen=True):
         return csr_array((values.reshape(-1), (rows, columns)), (3 * len(self.node), 3 * nodes))
 
     def factor(self, log_factor: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
-        """Return the factors on diffuse reflectance."""
+        """Return the factor on the diffuse reflectance of each observation."""
         return np.exp(np.sum(self.share * log_factor[self.node], axis=1))
 
     def turn_normals(
@@ -114,7 +114,7 @@ class Surfaces(msgspec.Struct, frozen=True):
 
     @property
     def first_nodes(self) -> dict[str, int]:
-        """Number of each mesh's first node."""
+        """Index of each mesh's first node, by mesh name."""
         counts = [mesh.nodes for mesh in self.meshes.values()]
         return dict(zip(self.meshes, np.cumsum([0, *counts[:-1]]).tolist()))
 
@@ -142,7 +142,7 @@ class Surfaces(msgspec.Struct, frozen=True):
         return {name: mesh.displacement(turns[name], observed[name]) for name, mesh in self.meshes.items()}
 
     def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the values of each mesh's nodes."""
+        """Split values at all nodes by mesh."""
         return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first_nodes.items()}
 
     def turns_from_displacements(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
@@ -152,7 +152,7 @@ class Surfaces(msgspec.Struct, frozen=True):
         return np.vstack(list((zero | turns).values()))
 
     def node_mask(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
-        """Return a mask of the nodes of these meshes."""
+        """Return a mask of the nodes of the meshes called `names`."""
         return np.concatenate([np.full(mesh.nodes, name in names) for name, mesh in self.meshes.items()])
 
 

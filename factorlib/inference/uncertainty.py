@@ -190,8 +190,8 @@ def information(
         size: Number of material unknowns.
 
     Returns:
-        The left side of (3) [size, size], and for each light with scores their values [g, size] less the part that the
-        light absorbs.
+        S [size, size], and for each light with scores their values s_k [g, size], less the part that the light
+        absorbs.
     """
     hessian = np.zeros((size, size))
     scores = []

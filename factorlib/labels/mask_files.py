@@ -31,6 +31,7 @@ LONGEST = 200  # greatest length of an outline, in half perimeters of the photo
 LONGEST_TOGETHER = 5000  # greatest length of all outlines of a photo together
 MOST_DIGITS = 7  # greatest number of 5-bit digits of a compressed run length: no picture has 2**35 pixels
 CURE = "export the file again"
+SIMPLER = "draw outlines with fewer corners, or export the file again"
 
 
 def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None) -> UInt16[np.ndarray, "h w"]:
@@ -186,7 +187,8 @@ def read_coco(
         place = f"annotations[{index}]"
         name = names.get(annotation.category_id)
         if name is None:
-            raise InputError(f"no category has id {annotation.category_id!r}", file=path, key=place, cure=CURE)
+            fault = f"category_id is {annotation.category_id!r}, but categories has no such id"
+            raise InputError(fault, file=path, key=place, cure="add the category, or correct category_id")
         if name not in materials:
             cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
             raise InputError(f"category {name!r} is no material", file=path, key=place, cure=cure)
@@ -200,8 +202,9 @@ def read_coco(
             shapes += [(place, counts) for counts in runs]
             length += longer
             if length > LONGEST_TOGETHER * sum(size):
-                fault = f"the outlines of this photo are {length:.3g} pixels long together, longer than any drawing"
-                raise InputError(fault, file=path, key=place, cure=CURE)
+                most = LONGEST_TOGETHER * sum(size)
+                fault = f"the outlines of this photo are {length:.3g} pixels long together; at most {most:,} are read"
+                raise InputError(fault, file=path, key=place, cure=SIMPLER)
         masks[name] = _union(shapes, size, path)
     return masks
 
@@ -257,10 +260,12 @@ def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
     same = [entry for entry in coco.images if PurePosixPath(entry.file_name) == PurePosixPath(image)]
     same = same or [entry for entry, name in zip(coco.images, bases) if name == base]
     if not same:
-        raise InputError(f"has no image {base!r}", file=path, key="images", cure=did_you_mean(base, bases))
+        raise InputError(
+            f"the COCO file has no image {base!r}", file=path, key="images", cure=did_you_mean(base, bases)
+        )
     if len(same) > 1:
         raise InputError(
-            f"has {len(same)} images {base!r}", file=path, key="images", cure=f"keep one, or name it {image!r} in full"
+            f"has {len(same)} images {base!r}", file=path, key="images", cure=f"keep one, or call one {image!r}"
         )
     return same[0]
 
@@ -292,14 +297,14 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
             fault = "is no polygon"
         elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
-            fault = f"leaves the image of {_wh(shape)} pixels"
-            cure = "was it drawn at another size? cut it at the image's edge"
+            fault = f"has corners outside the image of {_wh(shape)} pixels"
+            cure = "clip it to the image; if it was drawn at another size, export it at the photo's own size"
         else:
             corners = np.clip(corners, 0, limit)
             longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
             if longer > LONGEST * sum(shape):
-                fault = f"its outline is {longer:.3g} pixels long"
-                cure = "draw it again, with fewer corners"
+                fault = f"its outline is {longer:.3g} pixels long; at most {LONGEST * sum(shape):,} are read"
+                cure = SIMPLER
         if fault:
             raise InputError(fault, file=path, key=f"{key}[{index}]", cure=cure)
         polygons.append(corners.ravel().tolist())

@@ -76,7 +76,9 @@ class _BufferFiles(dict[str, bytes]):
         self.bytes_left -= len(content)
         index, length = max(((k, b.byteLength) for k, b in enumerate(self.buffers) if b.uri == uri), key=lambda k: k[1])
         if len(content) < length:
-            raise InputError(f"buffer {index} has {len(content)} of {length} bytes", file=self.path, cure=CURE)
+            raise InputError(
+                f"buffer {index} has {len(content)} bytes, but the header states {length}", file=self.path, cure=CURE
+            )
         return content
 
 
@@ -144,7 +146,7 @@ def _size(primitive: Primitive, header: GltfHeader, path: Path) -> tuple[int, in
     if primitive.mode not in (TRIANGLES, STRIP):
         return 0, 0
     if "POSITION" not in primitive.attributes:
-        raise InputError("a primitive has no POSITION", file=path, cure=CURE)
+        raise InputError("a primitive has no positions (attribute POSITION)", file=path, cure=CURE)
     used = [
         header.accessors[primitive.attributes[name]] for name in ("POSITION", "NORMAL") if name in primitive.attributes
     ]
@@ -157,7 +159,8 @@ def _size(primitive: Primitive, header: GltfHeader, path: Path) -> tuple[int, in
         )
     vertices = used[0].count
     if used[-1].count != vertices:
-        raise InputError("a primitive has another number of NORMAL than of POSITION", file=path, cure=CURE)
+        fault = f"a primitive has {used[-1].count} normals for {vertices} positions; the counts must be equal"
+        raise InputError(fault, file=path, cure=CURE)
     return vertices, corners.count // 3 if primitive.mode == TRIANGLES else max(corners.count - 2, 0)
 
 

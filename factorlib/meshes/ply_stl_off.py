@@ -52,7 +52,7 @@ Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, an
 Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # numbers of all rows, concatenated, and the count of each row
 VERTEX = re.compile(rb"^[ \t]*vertex\b", re.MULTILINE | re.IGNORECASE)
 COUNTS = re.compile(r"(?:(?:ST)?C?N?OFF)?\s*([0-9]+)\s+([0-9]+)[^\n]*")  # OFF itself is optional
-CURE = "is it whole, and of the kind its suffix says? copy or export it again"
+CURE = "the file may be incomplete, or of another format than its suffix: copy or export it again"
 
 
 def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
@@ -82,7 +82,7 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
     whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
     if not whole or ((corners := values.astype(np.int64)) != values).any():
-        raise InputError("a face names a vertex by a number that is not whole", file=path, cure=CURE)
+        raise InputError("a face has a vertex index that is not a whole number", file=path, cure=CURE)
     numbers = {name: floats(column) for name, (column, each) in columns.get("vertex", {}).items() if (each == 1).all()}
     if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
@@ -100,7 +100,7 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
     """
     end = END.search(content, 0, LONGEST)
     if not content.startswith(b"ply") or end is None:
-        raise InputError("has no header of a PLY", file=path, cure=CURE)
+        raise InputError("does not begin with the header of a PLY", file=path, cure=CURE)
     # if only the last line ends in \r\n, the \n is the first byte of the data
     data_begins = end.group(1) == b"\r\n" and b"\r\n" not in content[:5]
     order = None

@@ -24,7 +24,7 @@ from factorlib.reading import one_line, read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # formats of a single file
 FORMATS = (*WITHIN, ".glb", ".gltf")
-CURE = "is it whole? try to open and export it again"
+CURE = "the file may be incomplete: open it in a mesh editor and export it again"
 CREASE_DEG = 60.0
 log = logging.getLogger("factorlib.meshes")
 
@@ -251,7 +251,7 @@ def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray,
         raise InputError(
             "every face has zero area",
             file=file,
-            cure="look at it in an editor: it is flattened to a line or a point, or its scale is zero",
+            cure="correct it in a mesh editor: it is flattened to a line or a point, or its scale is zero",
         )
     return vertices, faces, solid & single
 

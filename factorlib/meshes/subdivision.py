@@ -72,8 +72,8 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
     """Subdivided mesh and its v nodes.
 
     mesh    subdivided mesh, which may have several vertices at one position
-    node    number of each vertex's node
-    faces   corners as numbers of nodes
+    node    index of the node of each vertex
+    faces   indices of the nodes at the corners
     extent  largest side of the bounding box, in mesh units
     """
 
@@ -164,7 +164,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
 
 
 def subdivided_mesh(mesh: Mesh) -> SubdividedMesh:
-    """Subdivide the mesh to edges of `LONGEST` times its extent."""
+    """Subdivide a mesh until no edge is longer than `LONGEST` times its extent, and number its nodes."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     dense = subdivide(mesh, LONGEST * extent)
     node = welded(dense.vertices)

@@ -155,12 +155,12 @@ def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
         raise InputError(fault, file=file, cure=cure)
 
     if len(soup.faces) == 0:
-        refuse("mesh without faces", "export triangles, not only points or lines")
+        refuse("the mesh has no faces", "export triangles, not only points or lines")
     low = int(soup.faces.min())
     high = int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
         refuse(
-            f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}",
+            f"a face uses vertex {(low if low < 0 else high) + 1}, but there are {len(soup.vertices)} vertices",
             "the file is damaged: copy or export it again",
         )
     bad = ~np.isfinite(soup.vertices).all(axis=1)

@@ -37,7 +37,7 @@ CURE = (
 
 
 class BaseRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
-    """Fields of every kind."""
+    """Fields that every kind of recipe has."""
 
     samples: Samples = 256
     """Samples per pixel of the path tracer; the noise falls with their square root."""
@@ -59,7 +59,7 @@ class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PhotoRecipe(BaseRecipe, frozen=True, kw_only=True):
-    """Fields of kinds that make pictures of each photo."""
+    """Fields of recipes that make pictures of each photo."""
 
     photos: list[str] = []
     """Photos whose camera, objects and light are used; by default all."""
@@ -68,14 +68,14 @@ class PhotoRecipe(BaseRecipe, frozen=True, kw_only=True):
 
 
 class ResizedRecipe(PhotoRecipe, frozen=True, kw_only=True):
-    """Fields of kinds whose pictures may differ from the photo in size."""
+    """Fields of recipes whose pictures may differ from the photo in size."""
 
     width: Pixels | None = None
     """Width of the pictures; by default that of the photo after downsampling by the pipeline."""
 
 
 class BackgroundRecipe(ResizedRecipe, frozen=True, kw_only=True):
-    """Fields of kinds that show a background beside the objects."""
+    """Fields of recipes whose objects may stand on a floor, before the light."""
 
     background: Literal["none", "light"] = "none"
     """Background of the objects: none (transparent), or the light."""
@@ -84,11 +84,11 @@ class BackgroundRecipe(ResizedRecipe, frozen=True, kw_only=True):
 
 
 class ResynthesisRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="resynthesis"):
-    """The photo with its objects replaced by path-traced ones."""
+    """Recipe of a photo with its objects replaced by path-traced ones."""
 
 
 class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
-    """The objects from another view: the camera moves about their middle; the light stays."""
+    """Recipe of the objects from another view: the camera moves about their middle; the light stays."""
 
     azimuth: Degrees = 30.0
     """Angle about the camera's upright axis, to the right in the photo."""
@@ -99,7 +99,7 @@ class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
 
 
 class TurntableRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="turntable"):
-    """An animation once around the objects; the light stays."""
+    """Recipe of an animation once around the objects; the light stays."""
 
     frames: Frames = 24
     """Number of pictures in the whole turn."""
@@ -108,7 +108,7 @@ class TurntableRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="turntabl
 
 
 class MovingLightRecipe(ResizedRecipe, frozen=True, kw_only=True, tag="moving_light"):
-    """An animation in which the light turns once about the camera's upright axis, so that highlights move."""
+    """Recipe of an animation in which the light turns once about the camera's upright axis."""
 
     frames: Frames = 24
     """Number of pictures in the whole turn."""
@@ -117,7 +117,7 @@ class MovingLightRecipe(ResizedRecipe, frozen=True, kw_only=True, tag="moving_li
 
 
 class RelightRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="relight"):
-    """The photo's objects in other lights."""
+    """Recipe of the photo's objects in other lights."""
 
     lights: list[str] = []
     """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); by default all other photos."""
@@ -126,7 +126,7 @@ class RelightRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="relight"):
 
 
 class TransferRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="transfer"):
-    """The photo with other materials on its objects."""
+    """Recipe of a photo with other materials on its objects."""
 
     materials: dict[str, str]
     """Replacement by material of the data set: another material of the data set, or one of `table`."""
@@ -144,7 +144,7 @@ class Polish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class InsertRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="insert"):
-    """A further object in the photo, standing beside an existing one, with its shadow."""
+    """Recipe of a photo with a further object beside an existing one, with its shadow."""
 
     mesh: str = "ball"
     """`ball`, a mesh of the data set, or a mesh file."""
@@ -169,7 +169,7 @@ class InsertRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="insert"):
 
 
 class GridRecipe(BaseRecipe, frozen=True, kw_only=True, tag="grid"):
-    """Balls of every material (rows) in every light (columns), including pairs that no photo shows."""
+    """Recipe of balls of every material (rows) in every light (columns), also of pairs that no photo shows."""
 
     materials: list[str] = []
     """Materials of the data set; by default all."""

@@ -212,7 +212,9 @@ def staged(
     scene: PhotoScene,
     orbit: Orbit = Orbit(),
 ) -> Float[np.ndarray, "h w 4"]:
-    """Render the objects from another view, before the light or a transparent background, on a floor if asked.
+    """Render the objects from another view, over the environment map or a transparent background.
+
+    They stand on a floor if the recipe requests one.
 
     The camera moves about the normal of the floor, or about the upright axis if there is no floor.
 

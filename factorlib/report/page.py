@@ -138,7 +138,7 @@ def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
 
 
 def forms(name: str, material: Reflectance) -> dict[str, str]:
-    """Return a material as text for each program, to paste there.
+    """Return a material as text to paste into each program, by program name.
 
     Numbers are linear; docs/formats.md describes how each program interprets them.
     """

@@ -91,7 +91,7 @@ def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndar
 
 
 def exposures(run: Artifacts) -> dict[str, float]:
-    """Return one exposure per photo for all balls and reflectance maps in its light: the photo's own."""
+    """Return the display exposure of each photo, which balls and reflectance maps in its light share."""
     photos = metrics.resynthesis.photos if (metrics := run.metrics) else {}
     return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
 

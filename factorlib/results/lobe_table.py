@@ -50,7 +50,7 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
         values = np.column_stack(numbers).reshape(-1, len(COLUMNS))
         illumination = np.array(columns["illumination"].to_pylist(), dtype=object)
         if not set(illumination) <= set(names):
-            raise ValueError("a lobe of an illumination that its metadata do not name")
+            raise ValueError("a lobe belongs to an illumination that the metadata do not name")
     parts = {name: values[illumination == name] for name in names}
     return {name: Lobes(part[:, :3].copy(), part[:, 3].copy(), part[:, 4:].copy()) for name, part in parts.items()}
 

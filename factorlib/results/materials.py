@@ -238,12 +238,12 @@ def solved(
 
 
 def read_uncertainty(path: str | Path) -> Uncertainty:
-    """Read uncertainty.json; InputError for another file."""
+    """Read uncertainty.json; InputError if the file has another form."""
     return read_result(path, Uncertainty, "solve")
 
 
 def read_materials(path: str | Path, cure: str = "") -> MaterialTable:
-    """Read materials.json; InputError for another file."""
+    """Read materials.json; InputError if the file has another form."""
     return read_result(path, MaterialTable, "solve", cure)
 
 
@@ -275,7 +275,7 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
 
 
 def read_exposures(path: str | Path, cure: str = "") -> dict[str, Channels]:
-    """Read the factors by photo, all positive; InputError for another file."""
+    """Read exposures.json: positive factors by photo; InputError if the file has another form."""
     exposures = read_result(path, dict[str, Channels], "solve", cure)
     for photo, channels in exposures.items():
         if min(channels) <= 0:

@@ -305,5 +305,5 @@ class Metrics(msgspec.Struct, frozen=True):
 
 
 def read_metrics(path: str | Path) -> Metrics:
-    """Read metrics.json; InputError for another file."""
+    """Read metrics.json; InputError if the file has another form."""
     return read_result(path, Metrics, "evaluate")

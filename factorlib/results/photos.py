@@ -40,10 +40,10 @@ class PhotoFacts(msgspec.Struct, frozen=True):
 
 
 def read_photo_facts(path: str | Path) -> PhotoFacts:
-    """Read the entry of one photo; InputError for another file."""
+    """Read the facts of one photo as `masks` writes them; InputError if the file has another form."""
     return read_result(path, PhotoFacts, "masks")
 
 
 def read_photos(path: str | Path) -> dict[str, PhotoFacts]:
-    """Read all entries by photo; InputError for another file."""
+    """Read photos.json: facts by photo; InputError if the file has another form."""
     return read_result(path, dict[str, PhotoFacts], "masks")

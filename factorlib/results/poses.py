@@ -34,7 +34,7 @@ class PoseEntry(msgspec.Struct, frozen=True):
 
 
 class RunnerUpPose(PoseEntry, frozen=True):
-    """The second-best pose.
+    """The runner-up: the best pose that differs clearly from the chosen one.
 
     Attributes:
         score: labelled IoU
@@ -72,7 +72,11 @@ class CameraEntry(msgspec.Struct, frozen=True):
     """The camera in pixels of <photo>.exr of `masks`, each of which covers factor² of the photo's.
 
     Attributes:
-        focal_source: see `align`
+        focal_px: focal length
+        principal_point: (x, y), pixel centres at 0.5
+        focal_source: dataset, colmap, transforms, bop, sfm, exif or estimated
+        focal_relative_stderr: standard error of the logarithm of the focal length
+        factor: factor by which `masks` reduced the photo
     """
 
     focal_px: Positive
@@ -94,12 +98,12 @@ class PhotoPoses(msgspec.Struct, frozen=True):
 
 
 def entry_of(pose: Pose) -> dict[str, Any]:
-    """Return the fields of a `PoseEntry`."""
+    """Return a pose as the fields of a `PoseEntry`."""
     return {"rotation": tuple(map(vec3, pose.rotation)), "translation": vec3(pose.translation)}
 
 
 def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
-    """Read the poses by photo; InputError for another file."""
+    """Read poses.json: poses by photo; InputError if the file has another form."""
     photos = read_result(path, dict[str, PhotoPoses], "align", cure)
     for name, photo in photos.items():
         _check(photo, path, f"{name}.objects", cure)
@@ -107,7 +111,7 @@ def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
 
 
 def read_photo_poses(path: str | Path) -> PhotoPoses:
-    """Read the entry of one photo; InputError for another file."""
+    """Read the poses of one photo as `align` writes them; InputError if the file has another form."""
     photo = read_result(path, PhotoPoses, "align")
     _check(photo, path, "objects", "run the stage `align` again")
     return photo

@@ -12,7 +12,7 @@ BEGINNING = "beginning.json"
 
 
 class Tried(msgspec.Struct, frozen=True):
-    """Evidence from photos that had no part in the surface; None for what was not tried.
+    """Evidence for a refinement from photos that it was not estimated from; None for what was not tried.
 
     Attributes:
         held_out_loss_with: loss of their held-out observations with the refinement
@@ -28,7 +28,7 @@ class Tried(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, evidence: Any, stiffness: float | None) -> "Tried":
-        """Convert the solver's evidence."""
+        """Convert the solver's decision and the chosen stiffness."""
         return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
 
 

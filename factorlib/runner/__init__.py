@@ -1,5 +1,5 @@
-"""The runner: which steps there are, which of them must run and why, and running them.
+"""Runner of the pipeline: it plans which steps must run, and why, and runs them.
 
-`plan` decides, as a pure function of what is declared, what everything hashes to and what the store holds; every verb
-renders or executes that one result.  Nothing here imports a stage, science, numpy or torch.
+The plan is a pure function of the declared stages, the hashes of their inputs and the content of the store.  Every verb
+prints or executes that plan.  Nothing here imports a stage, numpy or torch.
 """

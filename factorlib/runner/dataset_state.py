@@ -62,11 +62,16 @@ class StepInputs(NamedTuple):
 class DatasetState:
     """State of a dataset before a run; every verb shows or runs its plan.
 
+    project:  the checkout
+    data:     the dataset
+    results:  its results folder
+    store:    store of all results
+    spec:     requested stages, photos, recipes and forced steps
     records:  each step's record without the results of other steps
     inputs:   facts and files of each step
-    recipes:  requested ones, by name
+    recipes:  requested recipes, by name
     previous: each step's record when it last was current for this dataset
-    settings: of the command line, in place of values of pipeline.yaml
+    settings: settings of the command line, which replace values of pipeline.yaml
     """
 
     project: Project
@@ -81,12 +86,12 @@ class DatasetState:
     settings: Sequence[str]
 
     def plan(self, forced: frozenset[Step] | None = None) -> list[Planned]:
-        """Plan every step; `forced` replaces the spec's steps that must run."""
+        """Plan every step; `forced`, if given, replaces the steps that must run in any case."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
 
     def code(self, name: str) -> StageCode:
-        """Describe a stage for the worker that loads it."""
+        """Return the description of a stage with which a worker loads it."""
         stage = self.spec.pipeline.stages[name]
         cores = MOST_CORES if stage.cores == "all" else stage.cores
         place = self.project.code_root, self.project.package, name
@@ -151,7 +156,7 @@ def read_state(project: Project, request: Request, look: bool = False) -> Datase
         project: the project
         request: recipes in it add the stages over recipes; with the target `render` these are the only targets.  Such a
             stage among the targets, without recipes, stands for all recipes
-        look: nothing will run: recipes without targets mean only the stages over recipes
+        look: True if nothing will run; recipes without targets then request the stages over recipes alone
 
     Raises:
         InputError: Pipeline, settings, dataset or recipes are wrong.
@@ -163,8 +168,9 @@ def read_state(project: Project, request: Request, look: bool = False) -> Datase
         data = project.provider.read(project.dataset_folder(request.dataset))
         present = pipeline.for_data(lambda name: data.slice(name, None).facts is None)
         for name in (name for name in targets or [] if name not in present.stages):
-            fault = f"the stage {name!r} has nothing to do for this dataset"
-            raise InputError(fault, file=data.folder, key=pipeline.stages[name].when, cure="leave the stage out")
+            when = pipeline.stages[name].when
+            fault = f"the stage {name!r} does not apply: the dataset has nothing for it ({when})"
+            raise InputError(fault, file=data.folder, cure="leave the stage out")
         results = results_of(project, data.folder)
         store = Store(project.store)
         recipes = project.recipes(data, recipe_words)

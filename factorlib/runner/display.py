@@ -51,7 +51,7 @@ def printable_streams() -> Iterator[None]:
 
 
 class Display:
-    """Lines on standard error: starts, warnings, times.
+    """Display of a run on standard error: starts, warnings and times, a line each.
 
     On a terminal a bar for each stage stands below them, with the remaining time that rich estimates.
 

@@ -66,9 +66,9 @@ class Spec(msgspec.Struct, frozen=True):
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """Content of the store.
+    """Content of the store, as far as a plan depends on it.
 
-    outputs:  output hash by key, asked by `get`
+    outputs:  hash of the output by key; a mapping of which only `get` is called
     previous: each step's record when it last was current for this dataset
     damaged:  by key, the faults of a result that no longer has the files it was stored with, and so has no output
     """

@@ -67,7 +67,7 @@ class Provider(NamedTuple):
 
 
 def restore_sigterm() -> None:
-    """Return SIGTERM to Python: pycolmap, once imported, prints a C stack instead."""
+    """Restore Python's handler of SIGTERM, which importing pycolmap replaces by one that prints a C stack."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
@@ -206,7 +206,7 @@ class Project(msgspec.Struct, frozen=True):
 def check_name(name: str, kind: str, *, file: Any = None, key: str | None = None, reserved: Sequence[str] = ()) -> None:
     """Raise InputError for a name that a folder of results cannot have, or a reserved one.
 
-    kind: the named thing, with its article
+    kind: what the name is of, with its article, for the message
     """
     usable = name.isprintable() and "/" not in name and len(name.encode()) <= LONGEST
     if not usable or name in ("", ".", "..", *reserved):
@@ -216,9 +216,15 @@ def check_name(name: str, kind: str, *, file: Any = None, key: str | None = None
 
 
 class StageCode(msgspec.Struct, frozen=True):
-    """Module of a stage, its parameters and the file that sets them, and its share of the machine.
+    """Module of a stage, its parameters and their file, and its processors.
 
-    threads: of its libraries' numerics;  cores: the most for independent work
+    root:     folder that holds the package of stages
+    package:  name of that package
+    stage:    name of the module in it
+    params:   parameters by name
+    settings: file that sets them, for messages
+    threads:  threads of its numerical libraries
+    cores:    greatest number of cores for independent work
     """
 
     root: Path
@@ -244,7 +250,8 @@ DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 class Shipping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Location and origin of a result that ships with the source.
 
-    folder: of the package;  made_by: modules that determine the content
+    folder:  folder of the result, relative to the root of the source
+    made_by: modules that determine its content
     """
 
     folder: str
@@ -252,7 +259,7 @@ class Shipping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One stage.
+    """A stage as pipeline.yaml declares it.
 
     inputs:  names of stages, or `dataset.<slice>`
     over:    `photo` for a step per photo, `recipe` for one per requested recipe; otherwise one step for the whole set
@@ -314,7 +321,7 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     executor: Executor = "processes"
 
     def order(self) -> list[str]:
-        """Return the stages, each after those it takes, otherwise in the order of the file."""
+        """Return the stages in a topological order, the same in every run."""
         return list(TopologicalSorter({name: stage.upstream for name, stage in self.stages.items()}).static_order())
 
     def check(self, stages: Sequence[str]) -> None:
@@ -367,7 +374,11 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
         pipeline.order()
     except CycleError as error:
         cycle = " <- ".join(error.args[1])
-        refuse(f"stages need each other: {cycle}", "stages", "make the second pass a stage of its own")
+        refuse(
+            f"stages need each other: {cycle}",
+            "stages",
+            "remove one of these inputs; for a second pass, declare a further stage",
+        )
     return pipeline
 
 

@@ -49,7 +49,7 @@ NO_STAGE = "left over"  # damaged results, and files without a key
 
 
 class ResultsFolder(msgspec.Struct, frozen=True):
-    """One such folder, directly in build/."""
+    """The results folder of a dataset, build/<dataset>."""
 
     folder: Path
 
@@ -69,14 +69,14 @@ class ResultsFolder(msgspec.Struct, frozen=True):
             raise InputError(fault, file=self.keys_file, cure=cure) from None
 
     def owner(self, project: Project) -> Path | None:
-        """Return the dataset's folder; None if no file tells."""
+        """Return the folder of the dataset whose results these are; None if dataset.txt cannot be read."""
         with contextlib.suppress(OSError):
             path = self.mark.read_text(encoding="utf-8", errors="surrogateescape").strip()
             return project.root / path if path else None
         return None
 
     def set_owner(self, project: Project, dataset: Path) -> None:
-        """Write the dataset's folder down, relative to the project if it lies inside, so that checkouts can move."""
+        """Write the dataset's folder to dataset.txt, relative to a project around it, which can then move."""
         path = dataset.relative_to(project.root) if dataset.is_relative_to(project.root) else dataset
         if self.owner(project) != project.root / path:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -126,7 +126,7 @@ def find_results(project: Project, dataset: str | None) -> list[ResultsFolder]:
 
 
 def set_link(link: Path, target: Path, build: Path) -> None:
-    """Make `link` name the folder `target` in one atomic step; relative within `build`, so that it can be moved."""
+    """Create or replace a link to the folder `target` by one rename; inside `build` the link is relative."""
     words = os.path.relpath(target, link.parent) if target.is_relative_to(build) else str(target)
     if link.is_symlink() and os.readlink(link) == words:
         return
@@ -140,9 +140,9 @@ def set_link(link: Path, target: Path, build: Path) -> None:
 
 
 def view_of(store: Store, outputs: Mapping[str, str], gather: str | None) -> Path:
-    """Return the folder with the files of all photos of a stage ({photo: output}), as hard links.
+    """Return a folder with the files of all photos of a stage, as hard links, and create it if needed.
 
-    The contents of all `<photo>.json` are also in the file `gather`.
+    `outputs` gives the hash of each photo's result.  The file `gather` has the contents of all `<photo>.json`.
     """
     view = store.views / hash_of({"photos": dict(outputs), "gather": gather})
     trees = {store.trees / output: stamps_of(store.trees / output) for output in sorted(set(outputs.values()))}
@@ -175,7 +175,7 @@ def begin_run(store: Store) -> tuple[Path, BaseFileLock]:
 
 @contextlib.contextmanager
 def no_runs(store: Store) -> Iterator[None]:
-    """Keep runs from starting inside, where results are deleted; InputError if a run is going on."""
+    """Keep runs from starting while the code inside deletes results; InputError if a run is going on."""
     with _entrance(store):
         if any(is_locked(folder / LOCK) for folder in store.tmp.iterdir()):
             raise InputError("a run is going on", file=store.root, cure="wait until it has ended")
@@ -195,14 +195,17 @@ def _entrance(store: Store) -> Iterator[None]:
 
 
 def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int:
-    """List the results that no dataset's current results are or need, and delete them if `confirm` returns True.
+    """List the results that no current result is or was made from, and delete them if `confirm` returns True.
 
     Raises:
         InputError: A run is going on, or the store is shared.
     """
     if (store := Store(project.store)).root != project.build / "store":
         fault = "other checkouts share this store, and the results that they need are not known here"
-        cure = f"leave {SHARED} out for the store of this checkout; in the shared one delete trees and keys by age"
+        cure = (
+            f"leave {SHARED} out for the store of this checkout; in the shared one delete old folders in `trees`, old files "
+            "in `keys`, and all of `views` and `damaged`; the next run makes views again"
+        )
         raise InputError(fault, file=store.root, cure=cure)
     with no_runs(store):
         keys, trees, rest = _unused(project, store)

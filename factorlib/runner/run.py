@@ -63,10 +63,12 @@ def run(state: DatasetState, display: Display) -> Run:
 
 
 class Run:
-    """One run.
+    """Execution of one plan.
 
     Attributes:
-        completed, failed, held_up: steps that succeeded, that failed, and that wait for a failed one
+        completed: steps that succeeded
+        failed: steps that failed, with their outcomes
+        held_up: steps that need the result of a failed one
     """
 
     def __init__(self, state: DatasetState, display: Display, folder: Path, workers: Workers):

@@ -74,7 +74,7 @@ class _Cache(msgspec.Struct, array_like=True):
 class FileHashes:
     """Cache of values that are computed from files and trees; `save` writes it.
 
-    file: of the cache, None for none
+    file: file of the cache; None keeps it in memory
     """
 
     def __init__(self, file: Path | None):
@@ -188,7 +188,7 @@ class Store:
         return self._outputs.get(key)
 
     def forget(self, keys: Iterable[str] | None = None) -> None:
-        """Read these keys, or all, from disk when they are next asked for."""
+        """Drop these keys, or all, from memory, so that they are read from disk again."""
         for key in list(self._entries if keys is None else keys):
             for table in (self._entries, self._outputs, self.damaged):
                 table.pop(key, None)  # type: ignore[attr-defined]
@@ -286,7 +286,7 @@ def finish_tree(folder: Path) -> dict[str, str]:
     stamps = sorted(stamps_of(folder).items())
     if other := next((name for name, stamp in stamps if stamp == NO_FILE), None):
         fault = f"a stage wrote {other!r}, which is a link or a device"
-        raise InputError(fault, file=folder / other, cure="write a file")
+        raise InputError(fault, file=folder / other, cure="make the stage write a plain file")
     for name, _ in stamps:
         (folder / name).chmod(0o444)
     sync_tree(folder)

@@ -173,8 +173,12 @@ def show_logs(project: Project, request: Request, item: str | None) -> int:
     state = read_state(project, request, look=True)
     selected = [p for p in state.plan() if not request.targets or p.step.stage in request.targets]
     if not (selected := [p for p in selected if item in (None, p.step.item)]):
-        cure = did_you_mean(str(item), [*state.data.photos, *state.recipes])
-        raise InputError(f"no step is of the photo or recipe {item!r}", key="PHOTO", cure=cure)
+        if item is None:
+            raise InputError(
+                "the requested stages have no steps for this dataset", key="STAGE", cure="name other stages"
+            )
+        cure = did_you_mean(item, [*state.data.photos, *state.recipes])
+        raise InputError(f"no requested step belongs to a photo or recipe {item!r}", key="PHOTO", cure=cure)
     versions: dict[str, dict[str, None]] = {}
     for p in selected:
         if (entry := _result(state, p)) is None:

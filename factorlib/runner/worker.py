@@ -65,8 +65,18 @@ INTERVAL = 0.2  # seconds between two reports of progress
 class Task(msgspec.Struct, frozen=True):
     """Description of a step for a worker.
 
-    files:  path by the field of the record that has the file's hash
-    forced: run the stage even if its result ships with the source
+    code:      module and parameters of the stage
+    stage:     its declaration in pipeline.yaml
+    folders:   folder of each input result
+    facts:     facts of the dataset by slice
+    files:     path by the field of the record that has the file's hash
+    log:       log of the steps above; None for a stage that does not read it
+    store:     root of the store
+    key:       key of the step
+    record:    record of the key
+    temporary: folder for the unfinished result
+    events:    file to which progress and warnings are written
+    forced:    run the stage even if its result ships with the source
     """
 
     code: StageCode
@@ -84,9 +94,12 @@ class Task(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """Outcome of a step.
+    """Result or error of a finished step.
 
-    output: hash of the result;  traceback: of a defect, None for an error that the user can fix
+    output:    hash of the result; None after an error
+    error:     message of the error; None after a success
+    traceback: traceback of a defect of the program; None for an error that the user can fix
+    seconds:   time that the step took
     """
 
     output: str | None = None
@@ -342,7 +355,7 @@ def usable_cores() -> int:
 def connect(scheduler: str) -> Any:
     """Return a Dask client; InputError if Dask is not installed or no scheduler answers."""
     if find_spec("distributed") is None:
-        cure = "install it: make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+        cure = "install it: make setup EXTRAS=dask, or, in the checkout, pip install '.[dask]'"
         raise InputError("Dask is not installed", key="executor", cure=cure)
     from distributed import Client
 

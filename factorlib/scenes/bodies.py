@@ -56,7 +56,7 @@ def blob() -> list[Part]:
 
 
 def hook() -> list[Part]:
-    """Return a tube whose radius falls from .17 to .06."""
+    """Return a tube whose radius falls from 0.17 to 0.06."""
     t = np.linspace(0, 1, ROWS + 1)
     angle = 4.2 * t**1.3
     height = 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t)
@@ -136,7 +136,7 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
 
 @cache
 def mesh(shape: str) -> Mesh:
-    """Return the shape as it is photographed, read as a file of it would be."""
+    """Return the photographed mesh of a shape, with the normals and checks of a mesh that is read from a file."""
     return mesh_of(SHAPES[shape](), shape)
 
 
@@ -170,7 +170,7 @@ def decimated(part: Part, triangles: int) -> Part:
 
 
 def mesh_of(parts: list[Part], name: str) -> Mesh:
-    """Return the parts as one mesh; name: what an error calls it."""
+    """Return the parts as one mesh; `name` is its name in errors."""
     first = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts])
     faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, first)]).astype(np.int64)
     label = np.repeat([label for _, _, label in parts], [len(faces) for _, faces, _ in parts])

@@ -8,7 +8,7 @@ from factorlib.reflection import Name, Operator, reflection_operator
 
 
 def operator_variant(name: Name, dtype: str, *, compiled: bool = True) -> Operator | None:
-    """Return the operator in this precision; None where there is none, or nothing of it is compiled to leave out."""
+    """Return an operator in a precision, with or without its compiled code; None if it has no such variant."""
     with patch.dict(os.environ, {} if compiled else {"FACTORLIB_FUSED": "0"}):
         try:
             operator = reflection_operator(name, dtype=dtype)

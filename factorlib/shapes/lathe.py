@@ -57,7 +57,14 @@ NO_PROFILE = np.zeros((0, 2))
 
 
 class BodyView(msgspec.Struct, frozen=True):
-    """Body of revolution in a photo: profile, cam_from_body, camera of its fit, and overlap (IoU) with the outline."""
+    """Body of revolution in a photo.
+
+    profile   radii by height
+    pose      cam_from_body
+    camera    camera of the fit, with its focal length
+    overlap   IoU with the outline
+    tilt_deg  assumed tilt of the axis, degrees
+    """
 
     profile: Profile
     pose: Pose
@@ -67,7 +74,12 @@ class BodyView(msgspec.Struct, frozen=True):
 
 
 class TiltTrial(msgspec.Struct, frozen=True):
-    """Body that one outline gives at one tilt, and its poses in all judging photos."""
+    """Body of revolution computed from one outline for an assumed tilt of its axis.
+
+    outline  the outline
+    body     the body and its pose in that photo
+    poses    its fitted poses in the photos by which tilts are compared
+    """
 
     outline: Outline
     body: BodyView
@@ -75,7 +87,7 @@ class TiltTrial(msgspec.Struct, frozen=True):
 
     @property
     def overlap(self) -> float:
-        """Mean IoU over the judging photos."""
+        """Mean IoU over the photos by which tilts are compared."""
         return float(np.mean([pose.overlap for pose in self.poses]))
 
 
@@ -100,7 +112,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
     starts = [(outline, bodies) for outline in outlines[:REFERENCES] if (bodies := _plausible_bodies(outline))]
     if not starts:
         raise InputError(
-            "no outline is mirrored onto itself, as that of a body of revolution is",
+            "no outline is mirror-symmetric, as that of a body of revolution must be",
             cure=(
                 "add a photo that shows the whole outline from the side; give pixels of whatever hides the object the "
                 "label 255"

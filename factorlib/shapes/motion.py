@@ -67,7 +67,7 @@ class RegisteredCamera(msgspec.Struct, frozen=True):
 def cameras_by_motion(
     photos: Mapping[str, PhotoForMotion], report: Callable[[float, str], None] = lambda share, step: None
 ) -> dict[str, RegisteredCamera]:
-    """Estimate the cameras of photos that overlap; the others are named in a warning.
+    """Estimate cameras by structure from motion (COLMAP); a warning names the photos that cannot be registered.
 
     Args:
         photos: Photos by name.
@@ -87,7 +87,7 @@ def cameras_by_motion(
         models[region] = _map_photos(photos, masks, _half_report(done, region, report))
     region, (cameras, points) = max(models.items(), key=lambda item: (len(item[1][0]), item[1][1]))
     if len(cameras) < LEAST_PHOTOS:
-        fault = f"cameras of {len(cameras)} of {len(photos)} photos are found: too few of their features match"
+        fault = f"only {len(cameras)} of {len(photos)} photos can be registered: too few of their features match"
         cure = (
             "structure from motion needs photos of one scene, each 10 to 20° from the next, with texture on the object "
             "or around it; without, give `file`, `lathe` or `primitive` meshes"
@@ -103,7 +103,7 @@ def cameras_by_motion(
 
 
 def _half_report(done: int, region: str, report: Callable[[float, str], None]) -> Callable[[float, str], None]:
-    """Return the report of one of two models, after `done` others."""
+    """Return the progress report of one of two models, after `done` others."""
     return lambda share, step: report((done + share) / 2, f"{step} {region}")
 
 

@@ -122,7 +122,7 @@ def fit_proportions(
 def jacobian_with_shape(
     state: PoseState, arms: Float[np.ndarray, "n 3"], free: Float[np.ndarray, "3 k"] = BOX
 ) -> Float[np.ndarray, "n 2 m"]:
-    """Return the derivative of image points, in photo pixels, by the seven unknowns of `PoseState.moved` and by d.
+    """Return the derivative of image points, in photo pixels, by the unknowns of `PoseState.moved` and of the shape.
 
     Args:
         state: State of the mesh.

@@ -123,8 +123,9 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
         return observations
     height, width = maps["normal.x"].shape
     if len(observations) and (observations.x.max() >= width or observations.y.max() >= height):
+        reached = f"pixel ({observations.x.max()}, {observations.y.max()})"
         raise InputError(
-            f"its normals are of a picture of {width} × {height}",
+            f"its normal maps are {width} × {height} pixels, but the photo's observations reach {reached}",
             file=surface,
             key=observations.photos[0],
             cure="run the stage `surface` again",

@@ -49,7 +49,22 @@ UNITS = {
 
 
 class Observations(msgspec.Struct, frozen=True):
-    """Observations (n rows) of `materials` in `photos`; indices are positions in the tuples of names."""
+    """Observations of materials in photos, one a row.
+
+    normal        unit, camera frame
+    view          unit, toward the camera
+    radiance      linear Rec. 709
+    clipped       True for a channel whose radiance is a lower bound
+    material      index in `materials`; likewise photo and illumination
+    x, y          pixel
+    weight        number of pixels that the row stands for, times their confidence
+    visibility    visible share of each of k directions, 0 to 255; None if all are visible
+    met           codes of the surfaces that hide directions (`factorlib.geometry.sphere`)
+    exposures     t·S/N² of each photo from EXIF, None if it is unknown
+    confidence    confidence of the normal, 0 to 1
+    place         position as in `factorlib.light.distance`
+    detail        factor on the diffuse reflectance
+    """
 
     normal: Float[np.ndarray, "n 3"]
     view: Float[np.ndarray, "n 3"]  # unit, toward the camera
@@ -163,20 +178,20 @@ def _check(observations: Observations) -> None:
         index = getattr(observations, name)
         known = getattr(observations, kind)
         if len(index) and not 0 <= index.min() <= index.max() < len(known):
-            raise ValueError(f"column {name!r} points beyond the names of the metadata")
+            raise ValueError(f"column {name!r} has an index without a name in the metadata")
     if observations.exposures and len(observations.exposures) != len(observations.photos):
-        raise ValueError("the metadata have not one exposure for each photo")
+        raise ValueError("the metadata do not have one exposure for each photo")
     confidence = observations.confidence
     if confidence is not None and not ((confidence >= 0) & (confidence <= 1)).all():
-        raise ValueError("column 'confidence' is not between 0 and 1")
+        raise ValueError("column 'confidence' has a value outside 0 to 1")
     if observations.place is not None and not np.isfinite(observations.place).all():
-        raise ValueError("column 'place' is not finite")
+        raise ValueError("column 'place' has a value that is not finite")
     if observations.met is not None:
         if observations.visibility is None or observations.visibility.shape != observations.met.shape:
-            raise ValueError("column 'met' has not the directions of a column 'visibility'")
+            raise ValueError("column 'met' does not have one code per direction of 'visibility'")
         known = observations.met[observations.met != NO_OCCLUDER]
         if len(known) and known.max() >= BINS * len(observations.materials):
-            raise ValueError("column 'met' points beyond the names of the metadata")
+            raise ValueError("column 'met' has the code of a material without a name in the metadata")
 
 
 def concatenate(parts: Sequence[Observations]) -> Observations:
@@ -191,7 +206,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     cure = "run the stage `urm` again for all photos"
     materials = parts[0].materials
     if any(part.materials != materials for part in parts):
-        raise InputError("reflectance maps of different material lists", cure=cure)
+        raise InputError("the observations of the photos have different lists of materials", cure=cure)
     fields: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
     # renumber photos and illuminations over the sorted union of names
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
@@ -209,7 +224,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         shapes = {values.shape[1:] for values in given if values is not None}
         if len(shapes) > 1:
             counts = sorted(count for (count,) in shapes)
-            raise InputError(f"reflectance maps whose {name} has {counts} directions", cure=cure)
+            fault = f"the photos have different numbers of directions in {name!r}: {counts[0]} and {counts[1]}"
+            raise InputError(fault, cure=cure)
         for shape in shapes:
             filled = [
                 np.full((len(part), *shape), fill, dtype) if values is None else values

@@ -151,7 +151,7 @@ def _poses(
             )
             if not instances:
                 log.warning(
-                    "%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
+                    "%s: cameras.bop has no obj_id %d in image %s: the pose of %s in %s is searched by its mask",
                     refuse.file,
                     obj_id,
                     image.name,
@@ -165,8 +165,12 @@ def _poses(
     placed = {obj.name: similarities[obj.name] for obj in objects if obj.name in similarities}
     scales = sorted({similarity.scale for similarity in placed.values()})
     if len(scales) > 1:
-        fault = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
-        refuse("cameras.world_from_object", fault, "objects of one photo share its unit: scale the meshes' files alike")
+        fault = f"photo {photo.name!r} has objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
+        refuse(
+            "cameras.world_from_object",
+            fault,
+            "scale the mesh files so that all objects of a photo have the same scale",
+        )
     for name, similarity in placed.items():  # The mesh's unit replaces the source's, which changes no picture.
         assert image.cam_from_world is not None  # only bop has no world
         cam_from_object = image.cam_from_world * rigid(similarity.rotation, similarity.translation)

@@ -174,7 +174,7 @@ def read_bop(path: str, refuse: Refusal) -> list[SourceImage]:
         camera_refusal.when(
             skew != 0 or min(fx, fy, cx, cy) <= 0,
             f"{image}.cam_K",
-            "is not the camera of square axes",
+            "has a skew, or a focal length or principal point that is not positive",
             "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels",
         )
         # pixel centres from whole numbers to 0.5

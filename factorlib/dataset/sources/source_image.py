@@ -19,7 +19,7 @@ SIDE_PX = 1e6  # largest width or height of an image, pixels
 MOST_OFF_PX = 0.5  # largest distance from a pinhole of one focal length, anywhere in the image
 GRID = 33  # points per side at which the two are compared
 MOST_BYTES = 256_000_000  # largest size of a JSON file; a scene of BOP has some 10 MB
-DAMAGED = "the file is damaged: copy it again from where it came"
+DAMAGED = "the file is damaged: copy it again from its source"
 
 
 class SourceImage(msgspec.Struct, frozen=True):
@@ -126,7 +126,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
                 "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
                 "or resample photos and masks to square pixels"
             )
-        limit = f"up to {MOST_OFF_PX} px would not matter"
+        limit = f"at most {MOST_OFF_PX} px is allowed"
         refuse(key, f"{how}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
     return focal, centre
 
