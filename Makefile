@@ -82,7 +82,7 @@ help-all:
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
 	@echo 'make pack DATASET=… OUT=x.zip         a result as one file that travels: report, exports, meshes, lights, frames and units'
-	@echo 'make verify [DATASET=…]              read every stored result and list damaged ones (FORCE=1 replaces them)'
+	@echo 'make verify [DATASET=…]              read every stored result and list damaged ones; the next run that needs one makes it again'
 	@echo 'make clean [DATASET=… | STUDY=…]     remove the results of a dataset, of all datasets, or of a study (QUICK=1: its quick ones)'
 	@echo 'make gc                              list results that no dataset or study uses, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, types, tests'

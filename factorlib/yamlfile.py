@@ -35,8 +35,14 @@ _CORE = re.compile(  # YAML 1.2.2, section 10.3.2; a number of more digits is a 
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
 )
 _NOUNS = {
-    **{int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"},
-    **{list: "a list", tuple: "a list", dict: "a map, key: value"},
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+    type(None): "null",
+    list: "a list",
+    tuple: "a list",
+    dict: "a map, key: value",
 }
 _LIMITS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _FIELD = re.compile(r"(?P<fault>unknown|missing required) field `(?P<name>.*)`", re.DOTALL)

@@ -119,7 +119,7 @@ def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(c
 def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_path, monkeypatch):
     home, file = copy / "build" / "set", tmp_path / "a.zip"
     (home / "report").mkdir()
-    for name, words in (("a.tar", "cannot be written here"), ("none/a.zip", "cannot be written here")):
+    for name, words in (("a.tar", "does not end in .zip"), ("none/a.zip", "does not exist")):
         refusal(words, pack, home, tmp_path / name)
     pack(home, file)
     before = file.read_bytes()
@@ -132,7 +132,7 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
 
 @pytest.mark.parametrize("path, text, words", [
     ("export", None, ["export is missing", "make all DATASET=set"]),
-    ("export/dataset.json", None, ["lacks the facts of its data set", "make export DATASET=set"]),
+    ("export/dataset.json", None, ["has no facts of its data set", "make export DATASET=set"]),
     ("export/dataset.json", "[]", ["dataset.json", "make export DATASET=set"]),
     ("export/dataset.json", "", ["dataset.json", "run its stage again"]),
 ])  # fmt: skip

@@ -67,7 +67,7 @@ def test_a_good_file(tmp_path):
         ("ratio: 1\nrows: [\n", 3, None, "not YAML"),
         ("ratio: 1\nrows: &a [*a]\n", 2, "rows[0][0][0]", "nested more than 64 deep"),
         ("ratio: !!python/name:os.system x\n", 1, "ratio", "tag"),
-        ("ratio: 1\n? [a, b]\n: 2\n", 2, None, "a key that is not a word"),
+        ("ratio: 1\n? [a, b]\n: 2\n", 2, None, "a key is a list or a map, not a word"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_with_its_place(tmp_path, text, line, key, words):

@@ -48,8 +48,8 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
             key=f"photos[{photo}].objects[{name}].pose"
             if source == "dataset"
             else f"cameras.{source}: {photo}: {name}",
-            cure="correct the pose, x_cam = R x_object + t with x right, y down, z forward (negate y and z of an OpenGL "
-            "camera, which looks along −z), or remove the object from this photo",
+            cure="correct the pose, x_cam = R x_object + t with x right, y down, z forward (negate y and z of an "
+            "OpenGL camera, which looks along −z), or remove the object from this photo",
         )
     if behind := int(np.count_nonzero(depth <= 0)):
         log.warning(

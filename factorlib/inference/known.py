@@ -211,7 +211,10 @@ def extract_known(
                 f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
                 f"and {(of_photo & beside_ball).sum()} observations of other objects"
             )
-            cure = f"the ball needs {LEAST_BALL_PIXELS}, and its photo other objects: check mask and pose of the ball in the overlay of `align`"
+            cure = (
+                f"the ball needs {LEAST_BALL_PIXELS} pixels, and the photo another object: "
+                "check mask and pose of the ball in the overlay of `align`"
+            )
             raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
         world = photos[ball.photo].world_from_camera
         lights[name] = light_from_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))

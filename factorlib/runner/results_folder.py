@@ -203,8 +203,8 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
     if (store := Store(project.store)).root != project.build / "store":
         fault = "other checkouts share this store, and the results that they need are not known here"
         cure = (
-            f"leave {SHARED} out for the store of this checkout; in the shared one delete old folders in `trees`, old files "
-            "in `keys`, and all of `views` and `damaged`; the next run makes views again"
+            f"leave {SHARED} out for the store of this checkout; in the shared one delete old folders in `trees`, old "
+            "files in `keys`, and all of `views` and `damaged`; the next run makes views again"
         )
         raise InputError(fault, file=store.root, cure=cure)
     with no_runs(store):

@@ -192,7 +192,7 @@ BAD = [
     ("photos[0].objects[0].pose > .rotation", {**POSE, "rotation": MIRROR}, "reflection"),
     ("photos[0].objects[0].pose > .translation[1]", {**POSE, "translation": [0, NAN, 1]}, "finite"),
     (K0, KEYPOINTS[:3], "give 4 or more"),
-    (K0, ON_A_LINE, "every point lies on one line"),
+    (K0, ON_A_LINE, "each point lies on one line"),
     (f"{K0} > [4].pixel", [*KEYPOINTS, {"pixel": KEYPOINTS[1]["pixel"], "point": [9, 9, 9]}], "keypoints[1]"),
     (f"{K0} > [3].pixel[1]", [*KEYPOINTS[:3], {"pixel": [9, NAN], "point": [0, 0, 1]}], "finite"),
     ("photos[0].objects[1].keypoints", KEYPOINTS, "keep one"),
@@ -209,7 +209,7 @@ BAD = [
     ("meshes.vase > ", {"material": "red"}, "exactly one of file"),
     ("meshes.vase > ", {"file": "vase.ply", "hull": True, "material": "red"}, "file and hull"),
     ("meshes.vase > .size", {"hull": True, "material": "red", "size": 2.0}, "leave it out"),
-    ("meshes.vase > .hull", {"hull": True, "material": "red"}, "a hull needs two"),
+    ("meshes.vase > .hull", {"hull": True, "material": "red"}, "a hull needs at least two"),
     ("meshes.vase > .size", {"lathe": True, "material": "red", "size": 0.0}, "more than 0"),
     ("meshes.vase > .primitive", {"primitive": "cone", "material": "red"}, "cone"),
     ("meshes.vase > ", {"lathe": True, "hull": True, "material": "red"}, "hull and lathe"),
@@ -251,9 +251,9 @@ def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(fold
         "materials": {"wood": {"diffuse": [0, 0, 0], "specular": [0.5, 0.5, 0.5]}},
         "illumination": {"garden": "garden.exr", "kitchen": {"chrome": "box_1"}},
     }
-    caught = refusal("2 photos of unknown exposures", read_dataset, write(folder, spec))
+    caught = refusal("2 photos of unknown exposure", read_dataset, write(folder, spec))
     spec["known"]["exposure"] = {"kitchen": 1.0}
-    refusal("'hall' shares its light and has none", read_dataset, write(folder, spec))
+    refusal("'hall' shares the light of this one, but has no exposure", read_dataset, write(folder, spec))
     spec["known"]["exposure"]["hall"] = -1
     known = dataset_slice(read_dataset(write(folder, spec)), "known")
     assert caught.key == "known.illumination.kitchen.chrome" and known.files == ["garden.exr"]

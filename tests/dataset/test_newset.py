@@ -161,7 +161,7 @@ def test_an_object_is_of_the_mesh_that_its_mask_names(folder):
 
 def test_a_folder_that_is_there_is_left_alone_and_nothing_half_made_stays(folder):
     (folder / "data" / "mine").mkdir(parents=True)
-    refusal("is there already", made, folder)
+    refusal("exists already", made, folder)
     (folder / "data" / "mine").rmdir()
     (folder / "meshes" / "broken.obj").write_text("v 1 2\nf 1 2 3\n")
     refusal(r"broken\.obj", made, folder)

@@ -224,7 +224,7 @@ def test_bop_millimetres_become_the_meshs_units_and_whole_pixels_half_ones(folde
 
 
 @pytest.mark.parametrize("cameras, poses, key, words", [
-    ({"7": {"cam_K": [300.0, 5.0, 103.5, 0, 300.0, 70.5, 0, 0, 1.0]}}, None, "7.cam_K", "square axes"),
+    ({"7": {"cam_K": [300.0, 5.0, 103.5, 0, 300.0, 70.5, 0, 0, 1.0]}}, None, "7.cam_K", "has a skew"),
     ({"7": {"cam_K": [300.0, 0, 103.5, 0, 320.0, 70.5, 0, 0, 1.0]}}, None, "scene_camera.json: 7", "not square"),
     ({"7": {"cam_K": NINE[:4]}}, None, "7.cam_K", "cam_K"),
     (None, {"7": [GT, GT]}, "cameras.obj_ids.chair", "2 times"),

@@ -244,9 +244,9 @@ REFUSED = {
         (OBJ.replace("v 1.0", "v nan"), "not finite"),
         (OBJ.replace("v 1.0", "v one"), "line 6"), (OBJ.replace("f 1 ", f"f {LONG} "), "line 10"),
         (OBJ.replace("//1", f"//{LONG}"), "line 10"),
-        (OBJ.replace("vn 0 0 1", "vn 1"), "line 9"), (TRIANGLE + "f 1 2 4\n", "uses vertex 4 of 3"),
+        (OBJ.replace("vn 0 0 1", "vn 1"), "line 9"), (TRIANGLE + "f 1 2 4\n", "uses vertex 4, but there are 3 vertices"),
         (TRIANGLE + "f 1 2 0\n", "line 4"),
-        ("", "without faces"), (b"\0" * 100, "without faces|cannot be read"),
+        ("", "has no faces"), (b"\0" * 100, "has no faces|cannot be read"),
         (TRIANGLE.replace("0 1 0", "2 0 0") + "f 1 2 3\n", "zero area"),
         (OBJ.replace("1.0", "1e-300"), "1e-300"), (OBJ + "f" + " 1" * 1_500_000, "more than 2,000,000|has not three"),
         (OBJ + "g a\\\n" * 800_000, "more than 2,000,000"),
@@ -263,7 +263,7 @@ REFUSED = {
     STL_TEXT.replace("vertex 1.0 0.0 0.0\n", "", 1)],
     ("mesh", "b.stl"): [
         (STL.replace(ONE, SIGNALLING), "not finite"), STL[:-1], STL[:80] + b"\xff" * 4 + STL[84:],
-        (STL[:80] + bytes(4), "without faces"),
+        (STL[:80] + bytes(4), "has no faces"),
     ],
     ("mesh", "b.ply"): [
         (PLY.replace(ONE, NAN), "not finite"), PLY[:-1], PLY.replace(b"face 4", b"face %d" % HUGE),
@@ -332,7 +332,7 @@ REFUSED = {
     ],
     ("mask", "coco.json"): [
         *(coco(shape) for shape in BAD_SHAPES), (coco([ZIGZAG]), "pixels long"),
-        (coco(*WALLS), "longer than any drawing"),
+        (coco(*WALLS), "pixels long together"),
         *(coco([[2, 2, 8, 2, 8, 8]], image=i) for i in ({"file_name": 5}, {"id": None}, {"width": 10**15})), *JSONS,
         '{"images": 5}',
     ],
@@ -344,7 +344,7 @@ REFUSED = {
         (OBJ.replace("g shell", "g shell2"), "has no material|no part 'shell'"),
         (OBJ.replace("v 1.0", "v nan"), "not finite"),
     ],
-    ("objects", "buffers/b 1.bin"): [(DATA[:30], "has 30 of 72 bytes")],
+    ("objects", "buffers/b 1.bin"): [(DATA[:30], "has 30 bytes, but the header states 72")],
     ("true maps", "normals.exr"): [(widened(60_000, 30_000), "million values")],
     ("true maps", "light.exr"): [
         (widened(60_000, 30_000), "million values"),
@@ -393,8 +393,8 @@ REFUSED = {
         (channels(R=0, G=0, B=np.inf), "infinite"),
     ],
     ("observations", "a.parquet"): [
-        (with_values(material=np.full(5, 1)), "'material' points beyond the names"),
-        (with_values(photo=np.full(5, -1)), "'photo' points beyond the names"),
+        (with_values(material=np.full(5, 1)), "'material' has an index without a name"),
+        (with_values(photo=np.full(5, -1)), "'photo' has an index without a name"),
         (with_values(exposures=(1.0, 2.0)), "exposure for each photo"), (rewritten("weight"), "0 columns 'weight'"),
         (rewritten("x", pa.array([HUGE] * 5)), "not readable"),
         (rewritten("weight", pa.array([1.0, None, 1.0, 1.0, 1.0])), "'weight' has empty places"),
@@ -405,7 +405,7 @@ REFUSED = {
     ],
     ("lobes", "a.parquet"): [
         (many_rows, "200,000,000 rows, more than 100,000,000"),
-        (nameless_lobes, "an illumination that its metadata do not name"),
+        (nameless_lobes, "an illumination that the metadata do not name"),
     ],
     ("yaml", "a.yaml"): [(text, "more than 2,000 values") for text in (LAUGHS, "[" + "a," * 100_000 + "]")],
     ("json", "a.json"): [(text, "not readable as JSON") for text in (DEEP, LONG, "", "\x00", "{'a': 1}")],
@@ -531,7 +531,7 @@ def told(verb, capsys) -> str:
 
 FAULTS = {  # file -> what is in it, and words of the error
     "7.png": (b"no photo", "7.png"), "mask.png": (b"\x89PNG", "not readable as a PNG"),
-    "m/chair.obj": (OBJ.replace("v 1.0", "v nan"), "not finite"), "buffers/b 1.bin": (DATA[:30], "has 30 of 72 bytes"),
+    "m/chair.obj": (OBJ.replace("v 1.0", "v nan"), "not finite"), "buffers/b 1.bin": (DATA[:30], "has 30 bytes, but the header states 72"),
 }  # fmt: skip
 
 
@@ -552,10 +552,10 @@ def test_all_faults_are_said_at_once_and_each_once_without_running_anything(link
 CORNERS = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OF_RECIPES = {
     "not_a_map.hdr": (b"no map", "not readable as an image"), "black.exr": (np.zeros((8, 16, 3)), "the map is black"),
-    "square.exr": (np.ones((8, 8, 3)), "no lat-long map.*\n.*twice its height"),
-    "holes.exr": (np.full((8, 16, 3), np.nan), "are no numbers"), "faceless.obj": (CORNERS, "mesh without faces"),
+    "square.exr": (np.ones((8, 8, 3)), "a lat-long map is twice as wide as high"),
+    "holes.exr": (np.full((8, 16, 3), np.nan), "are NaN, infinite or above"), "faceless.obj": (CORNERS, "the mesh has no faces"),
     "flat.obj": (CORNERS + b"f 1 1 2\n", "every face has zero area"),
-    "cut.ply": (b"ply\nformat ascii 1.0\n", "has no header of a PLY"),
+    "cut.ply": (b"ply\nformat ascii 1.0\n", "does not begin with the header of a PLY"),
 }  # fmt: skip
 
 

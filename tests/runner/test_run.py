@@ -202,7 +202,7 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     steps = [line.split()[0] for line in logs("upper").splitlines() if not line.startswith(" ")]
     assert steps == ["upper/a", "upper/b"]
     assert "count/b" in logs(photo="b") and "upper/a" not in logs(photo="b")
-    with pytest.raises(InputError, match=r"no step is of the photo or recipe 'aa'") as caught:
+    with pytest.raises(InputError, match=r"no requested step belongs to a photo or recipe 'aa'") as caught:
         logs(photo="aa")
     assert caught.value.key == "PHOTO"
     said = logs("table", settings=["table.scale=3"])

@@ -155,7 +155,7 @@ def test_a_hull_agrees_with_its_masks_where_cameras_move_with_the_body_alone():
 def test_photos_that_do_not_overlap_are_refused():
     apart = [looking_from(20, 90.0 * k) for k in range(4)]
     error = refusal(
-        "of 4 photos are found",
+        "of 4 photos can be registered",
         cameras_by_motion,
         views_of(RESTING, apart, [looking_from(20, 40 + 90.0 * k) for k in range(4)]),
     )

@@ -117,7 +117,7 @@ def moved(tmp_path, translation, **known):
 def test_a_pose_behind_the_camera_is_refused_without_raw_warnings(tmp_path, z, known):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        caught = refusal("is not before the camera", run, tmp_path, moved(tmp_path, (0.0, 0.0, z), **known))
+        caught = refusal("is behind the camera", run, tmp_path, moved(tmp_path, (0.0, 0.0, z), **known))
     assert caught.key == "photos[a].objects[chair].pose" and "OpenGL" in caught.cure
     caught = refusal(
         ".", check_before_camera, blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap"

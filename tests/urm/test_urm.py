@@ -80,9 +80,9 @@ def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path, make):
 
 
 @pytest.mark.parametrize("key, change", [
-    ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence + 0.5}),
-    ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence * np.nan}),
-    ("'place' is not finite", lambda seen: {"place": seen.place * np.nan}),
+    ("'confidence' has a value outside 0 to 1", lambda seen: {"confidence": seen.confidence + 0.5}),
+    ("'confidence' has a value outside 0 to 1", lambda seen: {"confidence": seen.confidence * np.nan}),
+    ("'place' has a value that is not finite", lambda seen: {"place": seen.place * np.nan}),
     ("met", lambda seen: {"met": seen.met * 0 + 2 * BINS}), ("met", lambda seen: {"met": seen.met[:, :32]}),
 ])  # fmt: skip
 def test_values_that_mean_nothing_are_refused(tmp_path, key, change):
