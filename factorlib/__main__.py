@@ -187,7 +187,7 @@ def run(words: list[str], program: str) -> int:
 
 @contextlib.contextmanager
 def raise_on_signals() -> Iterator[None]:
-    """Raise SystemExit at SIGTERM or KeyboardInterrupt at SIGINT inside; later signals are ignored during clean-up."""
+    """Raise SystemExit at SIGTERM, or KeyboardInterrupt at SIGINT, in the code inside; ignore later signals."""
     in_main_thread = threading.current_thread() is threading.main_thread()  # Python sets handlers in no other thread.
     numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, _stop) for number in numbers}

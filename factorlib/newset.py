@@ -72,7 +72,7 @@ class Categories(msgspec.Struct):
 
 
 class Masks(msgspec.Struct):
-    """Masks of all photos.
+    """Masks of all photos, as dataset.yaml names them.
 
     Attributes:
         materials: Names of the materials, label k the k-th, from 1.

@@ -136,7 +136,7 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
 
 
 def read_bytes(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read a plain file.
+    """Read the whole content of a plain file.
 
     Args:
         file: the file

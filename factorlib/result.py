@@ -149,7 +149,7 @@ class Result:
 
     @property
     def objects(self) -> list[str]:
-        """Every object as <photo>/<object>."""
+        """Names of all objects, as <photo>/<object>."""
         return [f"{photo}/{obj.name}" for photo, each in self._solved.objects.items() for obj in each.objects]
 
     def environment(self, name: str) -> Environment:

@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def install_extras() -> None:
-    """Install EXTRAS of pyproject.toml.
+    """Install the extras of pyproject.toml that the environment variable EXTRAS names.
 
     Those in ALONE are installed without dependencies.  The others change no locked package.
     """

@@ -42,7 +42,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent) -> None:
-    """Write `<photo>.exr` and `<photo>.json`.
+    """Read a photo and its masks, and write `<photo>.exr` and `<photo>.json`.
 
     Channels of the EXR, float32:
 
@@ -92,7 +92,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
 def photo_facts(
     photo: Photo, facts: PhotoSlice, original_size: tuple[int, int], pixels: dict[str, int], valid: np.ndarray
 ) -> PhotoFacts:
-    """Summarise a photo.
+    """Return the facts about a photo that `masks` writes to its JSON file.
 
     Args:
         photo: The photo, as written.

@@ -37,7 +37,7 @@ FEW = 6  # number of a hull's outlines below which a warning is given: hulls kee
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Resolution of hulls."""
+    """Parameters of the stage: the resolution of hulls."""
 
     cells: Annotated[int, msgspec.Meta(ge=16, le=400)] = 80
     """Number of grid cells along a hull's longest side."""

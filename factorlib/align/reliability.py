@@ -210,7 +210,7 @@ def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
 
 
 def normal_spread(maps: Maps) -> Float[np.ndarray, "h w"]:
-    """Return turn of (1) in radians: the spread of the normals of the 3 × 3 pixels that show a mesh."""
+    """Return the spread of the normals in 3 × 3 pixels that show a mesh, radians: turn of (1)."""
     mesh = (maps.label > 0).astype(float)
     share = np.maximum(uniform_filter(mesh, 3, mode="constant"), 1e-12)
     sums = [uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)]

@@ -56,7 +56,7 @@ class SearchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PoseEstimate(msgspec.Struct, frozen=True):
-    """Estimated pose.
+    """Result of the search for the pose of one object.
 
     score             labelled IoU at the finest resolution
     log_focal_sigma   standard error of the log focal length
@@ -186,7 +186,7 @@ def _is_apart(result: RefinedState, others: Iterable[RefinedState], degrees: flo
 
 
 def render_maps(caster: Caster, target: Target, state: PoseState) -> Maps:
-    """Render the maps of the mesh in a state, in the target's window."""
+    """Render the maps (normals, labels, …) of the mesh at a pose, in the target's window."""
     return rasterise(caster, target.window(state.focal), state.pose(caster))
 
 

@@ -246,7 +246,7 @@ def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusa
             mesh.lathe and mesh.size != 1.0,
             f"{key}.pose",
             f"cannot be combined with meshes.{obj.mesh}.size: the pose determines the size",
-            "keep one",
+            "keep one of the two",
         )
     refuse.when(
         obj.keypoints and not mesh.file,
@@ -363,7 +363,7 @@ def _check_ground(key: str, ground: GroundEntry, refuse: Refusal) -> None:
     refuse.when(
         not any(ground.normal),
         key,
-        "a normal of length 0",
+        "the normal has length 0",
         "write the direction that points up from the ground, in the camera's axes",
     )
     refuse.when(

@@ -51,8 +51,10 @@ class Primitive(msgspec.Struct, frozen=True):
     """Triangles of one material.
 
     Attributes:
-        attributes: accessor by POSITION, NORMAL and so on
-        indices: accessor of the corners
+        attributes: index of an accessor, by POSITION, NORMAL and so on
+        indices: index of the accessor of the corners; None if positions are in order of corners
+        material: index of the material
+        mode: glTF's kind of primitive; 4 is triangles
     """
 
     attributes: dict[str, Count]

@@ -235,7 +235,7 @@ class KnownQuantities(_Format, frozen=True):
 
 
 class DatasetFile(_Format, frozen=True):
-    """Content of dataset.yaml."""
+    """Content of dataset.yaml, key by key (docs/dataset.md)."""
 
     format: Annotated[Literal[1], Meta(description="this version reads format: 1")]
     materials: Annotated[list[Name], OneOf254]

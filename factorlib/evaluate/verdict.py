@@ -43,7 +43,7 @@ LEAST_SHARE = 0.2  # least share of e² for a term to be a reason
 
 
 def ball_changes(materials: Mapping[str, Solved], lights: Mapping[str, OctahedralLight]) -> dict[str, float]:
-    """Return m² of (1) for each material, by which its standard errors change its ball, mean over lights.
+    """Return the mean square change of each material's ball by its standard errors, m² of (1), mean over lights.
 
     Both arguments are in one gauge, and the materials have standard errors.
     """

@@ -31,7 +31,7 @@ KINDS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
 def write_scene(path: str | Path, scene: ExportedScene) -> None:
-    """Write the scene as XML; the light's exposure is grey, and its file is a map for Mitsuba."""
+    """Write the scene as XML for Mitsuba; its light must have a grey exposure and a map in Mitsuba's layout."""
     root = ET.Element("scene", version=VERSION)
     for name, value in {"spp": SAMPLES, "max_depth": scene.max_depth}.items():
         ET.SubElement(root, "default", name=name, value=str(value))

@@ -75,7 +75,7 @@ def distribution(alpha: float, nh: Float[np.ndarray, "*n"]) -> Float[np.ndarray,
 
 
 def solved(material: Reflectance, angles: Angles) -> Parts:
-    """Evaluate the model of the solve."""
+    """Evaluate the reflection model of the solve."""
     return _parts(angles, material.diffuse, material.specular, separable(material.alpha, angles))
 
 
@@ -129,7 +129,7 @@ def _root(alpha: float, cosine: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*
 
 
 def albedo(alpha: float, no: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Return E by n·o, the albedo of a height-correlated GGX of F = 1 in a constant light, interpolated in a table."""
+    """Return E, the albedo of a height-correlated GGX of F = 1 at each n·o, interpolated in a table."""
     return np.interp(no, *_albedo_table(alpha))
 
 
@@ -245,7 +245,7 @@ def ball(material: Reflectance, model: Model) -> Float[np.ndarray, "n 3"]:
 
 
 def in_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Integrate f n·i over the hemisphere, in a sky of radiance 1.
+    """Return the radiance ∫ f n·i di that a reflection model sends to views at some angles, in a sky of radiance 1.
 
     Args:
         material: the reflectance

@@ -95,7 +95,7 @@ def colours(material: Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.
 
 
 def with_roughness_of_file(material: Reflectance) -> Reflectance:
-    """Return the material with the roughness that the file has.
+    """Return the material with the roughness that is written to the USD file.
 
     Without k_s the roughness is free.  It is set to 1, where the Fresnel term, which UsdPreviewSurface cannot omit, is
     least visible.

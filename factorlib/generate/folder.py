@@ -142,9 +142,9 @@ def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Map
 
 
 def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
-    """Reduce a fine grid with a border of one pixel to pixels: the value on which all rays agree, else 255.
+    """Reduce labels of subpixels, with a border of one pixel, to labels of pixels.
 
-    The rays are those of the pixel and of the nearest ones around it.
+    A pixel gets the label on which all its subpixels and the nearest ones around it agree, else 255.
     """
     windows = np.lib.stride_tricks.sliding_window_view(fine, (SUBPIXELS + 2, SUBPIXELS + 2))
     windows = windows[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
@@ -185,7 +185,7 @@ def pose_entry(pose: Pose) -> dict[str, Any]:
 def write_records(
     out: Path, comment: str, materials: Mapping[str, Any], meshes: dict[str, Any], photos: list[Any], poses: Poses
 ) -> None:
-    """Write dataset.yaml and truth/truth.yaml.
+    """Write dataset.yaml and truth/truth.yaml of a generated data set.
 
     Args:
         out: Folder of the data set.

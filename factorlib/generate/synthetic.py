@@ -36,7 +36,7 @@ MATERIALS = {
 
 
 class SyntheticOptions(msgspec.Struct, frozen=True):
-    """Parameters of the set.
+    """Options of the synthetic set.
 
     width, height    size of photos, pixels
     focal_px         focal length, pixels

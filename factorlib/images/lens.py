@@ -26,7 +26,7 @@ class RadialLens(msgspec.Struct, frozen=True):
 
     @property
     def colmap(self) -> pycolmap.Camera:
-        """Equivalent camera of pycolmap."""
+        """The lens as a camera of pycolmap."""
         width, height = (max(1, round(2 * c)) for c in self.centre)
         params = [self.focal, *self.centre, *self.coefficients]
         return pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)

@@ -82,7 +82,7 @@ def open_photo(path: str | Path, key: str | None = None) -> OpenPhoto:
 
 
 def read_photo(path: str | Path, encoding: str | None = None, key: str | None = None) -> Photo:
-    """Read a photo as displayed, in its own pixels.
+    """Read a photo as displayed, at full resolution.
 
     Args:
         path: File.
@@ -236,7 +236,7 @@ def whole_boxes(picture: Shaped[np.ndarray, "h w *c"], factor: int) -> Shaped[np
 def box_sum(
     picture: Shaped[np.ndarray, "h w *c"], factor: int, kind: type = np.float64
 ) -> Shaped[np.ndarray, "i j *c"]:
-    """Sum over boxes.
+    """Sum a picture over boxes of factor × factor pixels.
 
     Args:
         picture: Picture.

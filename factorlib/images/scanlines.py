@@ -34,7 +34,7 @@ CHANNELS = 4  # greatest number of channels of an ordinary photo
 
 
 class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
-    """Open photo.
+    """Photo whose header has been read, and whose rows can be read in chunks.
 
     width, height  size as stored
     orientation    EXIF's, of the stored pixels: 1 as displayed, 2 to 4 mirrored or rotated by 180°, 5 to 8 transposed

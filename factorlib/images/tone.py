@@ -22,22 +22,22 @@ TOE = 0.02  # ε
 
 
 def curve(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Return τ(x) of (1) for x ≥ 0."""
+    """Return τ(x), the tone curve (1), for x ≥ 0."""
     return ((x + TOE) ** exponent - TOE**exponent) / _range(exponent)
 
 
 def inverse(y: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Return x ≥ 0 with τ(x) = y, and 0 for y < 0."""
+    """Return x ≥ 0 with τ(x) = y, the inverse of the tone curve (1); 0 for y < 0."""
     return (np.maximum(y, 0.0) * _range(exponent) + TOE**exponent) ** (1 / exponent) - TOE
 
 
 def slope(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Return dτ/dx."""
+    """Return dτ/dx, the slope of the tone curve (1)."""
     return exponent * (x + TOE) ** (exponent - 1) / _range(exponent)
 
 
 def by_log_exponent(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Return dτ/d log g."""
+    """Return dτ/d log g, the derivative of the tone curve (1) with respect to its log exponent."""
     at_x, at_black, at_one = (end**exponent * np.log(end) for end in (x + TOE, TOE, 1 + TOE))
     return exponent * (at_x - at_black - curve(x, exponent) * (at_one - at_black)) / _range(exponent)
 
@@ -57,7 +57,7 @@ def shown(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> F
 
 
 def straightened(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
-    """Invert `shown`.
+    """Undo the tone curve of a photo, the inverse of `shown`.
 
     Args:
         radiance: Values of the photo.
@@ -99,7 +99,7 @@ def srgb_encode(linear: Values) -> Values:
 
 
 def gamma_decode(encoded: Values) -> Values:
-    """Return encoded^2.2."""
+    """Convert values with the encoding gamma2.2 to linear ones: encoded^2.2."""
     return np.copysign(np.abs(encoded) ** 2.2, encoded)
 
 

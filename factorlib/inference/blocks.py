@@ -32,7 +32,7 @@ class Noise(msgspec.Struct, frozen=True):
     most_weight: float = 8.0
 
     def sigma(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return σ of one pixel."""
+        """Return the standard deviation σ of a pixel's radiance."""
         return np.sqrt(self.absolute**2 + (self.relative * radiance) ** 2)
 
     def precision(
@@ -162,7 +162,7 @@ class Block(msgspec.Struct, frozen=True):
         )
 
     def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, " n"]) -> Block:
-        """Return the same observations with other normals and with that detail of reflectance.
+        """Return the same observations with other normals and with a detail of reflectance.
 
         The block must have no detail yet.
         """

@@ -60,7 +60,7 @@ class Hyperparameters(msgspec.Struct, frozen=True):
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """Result of a fit.
+    """Materials and lights that were fitted, with the hyperparameters and the value of the objective.
 
     Attributes:
         point: Materials and lights.
@@ -108,7 +108,7 @@ class FitSchedule(msgspec.Struct, frozen=True):
 
     @property
     def points(self) -> int:
-        """Largest number of points that a fit evaluates."""
+        """Largest number of points that a fit by this schedule evaluates."""
         return self.light_steps + 1 + sum(iterations + 1 for iterations in self.descents)
 
 
@@ -221,7 +221,7 @@ def estimate_hyperparameters(likelihood: LightLikelihood, system: System, least:
 
 
 def estimate_temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
-    """Return T of (1) from whitened residuals."""
+    """Return the temperature T of (1), by which correlated residuals count less, from whitened residuals."""
     number = block.clusters()
     bounded = residual.clip(-FIT_LOSS.robust_scale, FIT_LOSS.robust_scale)
     sums = [np.bincount(number, channel) for channel in bounded.T]

@@ -63,7 +63,7 @@ LAST = {"lights": (3, 14), "suns": (4, 10)}
 
 
 def ignore_event(event: Event) -> None:
-    """Ignore an event."""
+    """Ignore an event, as the report of a solve without a listener."""
 
 
 class SolveState(msgspec.Struct, frozen=True):

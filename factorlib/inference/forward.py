@@ -145,7 +145,7 @@ class Illumination(msgspec.Struct, frozen=True):
         return self.predict().radiance
 
     def residuals(self) -> Float[np.ndarray, "n 3"]:
-        """Return r, in σ of the noise model."""
+        """Return the residuals r of all observations, in σ of the noise model."""
         return self.block.residuals(self.radiance())
 
     def losses(self, loss: RobustLoss) -> Float[np.ndarray, " n"]:
@@ -186,7 +186,7 @@ class Illumination(msgspec.Struct, frozen=True):
         return np.sqrt(counts * loss.weights(residual) / temperature)
 
     def gradient(self, loss: RobustLoss, temperature: float) -> Gradient:
-        """Return Σ ρ(r)/T of the fitted observations and half its gradient, without a Jacobian.
+        """Return the robust loss Σ ρ(r)/T of the fitted observations and half its gradient, without a Jacobian.
 
         The cost is two products of the responses with three columns.
         """
@@ -223,7 +223,7 @@ class Illumination(msgspec.Struct, frozen=True):
 
     @property
     def bounced(self) -> Float[np.ndarray, "n 3"] | float:
-        """Part of ℓ that other surfaces send."""
+        """Part of the linear radiance ℓ that other surfaces send."""
         block = self.block
         if block.bounced is None:
             return 0.0
@@ -298,7 +298,7 @@ class Illumination(msgspec.Struct, frozen=True):
 
 
 def material_slices(block: Block) -> list[tuple[int, slice]]:
-    """Return (material, rows) of runs of one material, each of at most CHUNK rows."""
+    """Split a block into runs of one material, at most CHUNK rows each; return (material, rows) of each."""
     starts = np.flatnonzero(np.diff(block.material, prepend=-1))
     ends = np.append(starts, len(block))[1:]
     return [

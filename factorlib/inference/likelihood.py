@@ -97,7 +97,7 @@ class System(NamedTuple):
 
 
 class LightLikelihood(msgspec.Struct, frozen=True):
-    """Likelihood of one light's observations with the prior of that light.
+    """Marginal likelihood of the observations in one light, under the prior on that light.
 
     Attributes:
         illumination: Observations and light, with its table of responses.
@@ -131,7 +131,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, illumination=illumination)
 
     def gradient(self) -> Gradient:
-        """Return φ and half its gradient, by materials and by the light."""
+        """Return φ, minus twice the log posterior of the light, and half its gradient by materials and light."""
         data = self.illumination.gradient(self.loss, self.temperature)
         value, slope = self._prior()
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
@@ -297,7 +297,7 @@ def _determinant_derivatives(
 
 
 def gram_matrix(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
-    """Return JᵀJ; BLAS computes one triangle of it."""
+    """Return the Gram matrix JᵀJ; BLAS computes one triangle of it."""
     lower = ssyrk(1.0, J.T, lower=1)
     return lower + np.tril(lower, -1).T
 
@@ -330,5 +330,5 @@ def cholesky_inverse(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n
 
 
 def solve_cholesky(factor: Float[np.ndarray, "l l"], values: Float[np.ndarray, "l ..."]) -> Float[np.ndarray, "l ..."]:
-    """Return L⁻¹ of a vector or of columns, L given by its lower Cholesky factor."""
+    """Solve L x = `values` for a vector or for columns, with L given by its lower Cholesky factor."""
     return cho_solve((factor, True), values, check_finite=False)

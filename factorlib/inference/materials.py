@@ -15,7 +15,7 @@ LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
 
 
 class Materials(msgspec.Struct, frozen=True):
-    """Set of m materials.
+    """Reflectances and roughnesses of m materials.
 
     Attributes:
         diffuse: k_d per channel.

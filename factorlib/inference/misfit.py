@@ -62,7 +62,7 @@ def _energies(
 
 
 def correlated_energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> float:
-    """Return E of (1); groups of fewer than `LEAST_GROUP` observations are left out.
+    """Return the correlated energy E of (1); groups of fewer than `LEAST_GROUP` observations are left out.
 
     >>> alike, noise = np.full((8, 3), 0.1), np.tile([[0.1], [-0.1]], (4, 3))
     >>> round(correlated_energy(alike, np.zeros(8, int)), 9), correlated_energy(noise, np.zeros(8, int))

@@ -98,7 +98,7 @@ class Arrow:
         self.schur = cho_factor(((schur + schur.T) / 2)[np.ix_(self.free, self.free)], check_finite=False)
 
     def solve(self, by_materials: Vector, by_lights: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
-        """Return H⁻¹ g, by (3)."""
+        """Return H⁻¹ g, the solution of the normal equations, by (3)."""
         # L_i⁻¹ g_i, then dm by the Schur complement, then L_i⁻¹ (g_i − C_iᵀ dm)
         light_steps = [solve_cholesky(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
         reduced = by_materials.copy()
@@ -266,7 +266,7 @@ def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLi
 
 
 def determinant_terms(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """Return a and D of (2), summed over lights."""
+    """Return a and D of (2), the derivatives of the determinants of all lights."""
     gradient = np.zeros(size)
     hessian = np.zeros((size, size))
     for system in systems:

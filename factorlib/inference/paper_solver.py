@@ -211,7 +211,7 @@ class PaperObjective:
         return (bounded[:, :3], bounded[:, 3:6], low + (high - low) * bounded[:, 6]), lights
 
     def point(self, x: Tensor) -> Point:
-        """Return the materials and lights that x encodes."""
+        """Return the materials and lights that the vector x of unknowns encodes."""
         (diffuse, specular, roughness), lights = self.unpack(x)
         vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
         arrays = [[part.numpy() for part in light] for light in lights]
@@ -256,7 +256,7 @@ class PaperObjective:
 
 
 class UnitReflection(torch.autograd.Function):
-    """Differentiable D and S [n, p] without shadows, with the derivatives of the operator's `response`."""
+    """Differentiable responses D and S [n, p] without shadows, with the derivatives of the operator's `response`."""
 
     @staticmethod
     def forward(
@@ -266,7 +266,7 @@ class UnitReflection(torch.autograd.Function):
         log_sharpness: Tensor,
         *cosines: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return D and S from the cosines n·o [n], n·z and o·z [n, p]."""
+        """Return the responses D and S from the cosines n·o [n], n·z and o·z [n, p]."""
         inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), *cosines)]
         r = operator.response(*inputs)
         slopes = (

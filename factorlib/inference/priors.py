@@ -160,7 +160,7 @@ class PriorTerms(NamedTuple):
 
 
 class MaterialPrior:
-    """Prior on m materials that are linked by some blocks.
+    """Prior on m materials: their classes, (1), and the brightness of linked materials, (2).
 
     The start is that of the present fit, so the wide Gaussian about it moves from fit to fit.  Materials without a
     specular part at the start have no prior on it.

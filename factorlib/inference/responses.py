@@ -43,7 +43,7 @@ Rows = slice | Int[np.ndarray, " n"]
 
 
 def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Operator) -> Float[np.ndarray, "n p"]:
-    """Return D at `rows`, float64.
+    """Return the diffuse responses D of the observations `rows` to lobes of weight one, float64.
 
     Args:
         block: Observations.
@@ -61,7 +61,7 @@ def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Opera
 def specular_response(
     block: Block, rows: Rows, lobes: UnitLobes, roughness: float, operator: Operator
 ) -> Float[np.ndarray, "n p"]:
-    """Return S at `rows` for a material of the given roughness, float64.
+    """Return the specular responses S of the observations `rows`, of one roughness, to lobes of weight one, float64.
 
     Args:
         block: Observations.
@@ -78,7 +78,7 @@ def specular_response(
 
 
 def lobe_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-    """Return n·z', o·z' and w'/w of (1) of `factorlib.light.distance`, each [n, p].
+    """Return the cosines n·z', o·z' and weights w'/w of (1) of `factorlib.light.distance`, [n, p].
 
     Shadows do not use them: for visibility the light is infinitely far away.
 
@@ -161,7 +161,7 @@ class Responses(NamedTuple):
 
     @property
     def by_roughness(self) -> Float[np.ndarray, "n p"]:
-        """Derivative ∂S/∂roughness."""
+        """Derivative of the specular response, ∂S/∂roughness."""
         return self._interpolate(self.slope)
 
     def _interpolate(self, weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n p"]:

@@ -161,7 +161,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
         )
 
     def restrict_turns(self, detail: Detail, meshes: set[str]) -> Detail:
-        """Return the detail with the turns of these meshes alone."""
+        """Return the detail with turns on some meshes alone, called `meshes`."""
         turn = np.where(self.surfaces.node_mask(meshes)[:, None], detail.turn, 0.0)
         return msgspec.structs.replace(detail, turn=turn)
 
@@ -270,7 +270,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
 
 
 class StiffnessChoice(NamedTuple):
-    """Likeliest of several stiffnesses.
+    """Result of a search for the likeliest stiffness.
 
     Attributes:
         stiffness: Stiffness.
@@ -309,7 +309,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
         thresholds: tuple[float, float],
         movable: Bool[np.ndarray, " v"],
     ) -> StiffnessChoice:
-        """Return the likeliest stiffness.
+        """Select the stiffness of the detail with the largest marginal likelihood of the photos.
 
         The search goes from stiff to soft.  It ends at a stiffness that is less likely than the previous one, or
         with clear evidence against the detail.
@@ -370,7 +370,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
         return detail
 
     def select_meshes(self, turned: Sequence[Detail]) -> set[str]:
-        """Return the meshes that gain from their turns alone."""
+        """Return the meshes whose turns alone, without those of other meshes, improve held-out photos."""
         names = self.trial.surfaces.meshes
         if len(names) == 1:
             return set(names)

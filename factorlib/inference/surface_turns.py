@@ -84,7 +84,7 @@ class Attached(msgspec.Struct, frozen=True):
     def turn_normals(
         self, normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "v 3"]
     ) -> Float[np.ndarray, "n 3"]:
-        """Return n' of (1), unit.
+        """Return the turned normals n' of (1), unit.
 
         |n' − n| is at most `LARGEST_TURN` before normalisation, and no normal turns away from the viewer.
 
@@ -120,7 +120,7 @@ class Surfaces(msgspec.Struct, frozen=True):
 
     @property
     def nodes(self) -> int:
-        """Number of all nodes."""
+        """Number of the nodes of all meshes."""
         return sum(mesh.nodes for mesh in self.meshes.values())
 
     def laplacian(self) -> csr_array:
@@ -242,7 +242,7 @@ class LightTerms(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def factor(self) -> tuple[np.ndarray, bool]:
-        """Cholesky factor of H."""
+        """Cholesky factor of H, the Hessian of the light."""
         return cho_factor(self.hessian)
 
     @property
@@ -362,7 +362,7 @@ def solve_detail(
     detail: Detail,
     movable: Bool[np.ndarray, " v"] | None = None,
 ) -> Detail:
-    """Return the detail that minimises (2).
+    """Return the turns and log factors of all nodes that minimise (2).
 
     Args:
         parts: Linearised lights.

@@ -253,7 +253,7 @@ def largest_variance(
 
 
 def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]) -> Float[np.ndarray, "k k"]:
-    """Return (1) from scores with the lights eliminated, one a row.
+    """Return the sandwich covariance (1) from the scores of clusters, with the lights eliminated, one a row.
 
     It is widened by Student's t for the number of clusters, and zero for fewer than two.
     """

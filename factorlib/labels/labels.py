@@ -23,7 +23,7 @@ log = logging.getLogger("factorlib.labels")
 
 
 class Labels(msgspec.Struct, frozen=True):
-    """Label map.
+    """Material labels of the pixels of a photo.
 
     label      0 background, k the k-th material
     left_out   True for pixels that are neither background nor a material, whose label is 0

@@ -23,7 +23,7 @@ A = Any  # np.ndarray or torch.Tensor
 
 
 def finite_distance_cosines(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A, A, A]:
-    """Return n·z', o·z' and w'/w of (1), each [n, p].
+    """Return the cosines n·z', o·z' and weights w'/w of lobes at a finite distance, (1), each [n, p].
 
     All vectors are in one frame; n, o and z are unit.  |X| is limited to `LONGEST`.
 
@@ -47,7 +47,7 @@ def finite_distance_cosines(place: A, normal: A, view: A, axis: A, curvature: fl
 def relative_positions(
     view: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Return x of the n points of a photo, in the camera frame.
+    """Return the positions x of a photo's n points relative to their centre, in the camera frame.
 
     Args:
         view: Unit vectors toward the camera.

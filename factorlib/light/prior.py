@@ -126,7 +126,9 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         log_radiance: Float[np.ndarray, "3 p"],
         covariance: Float[np.ndarray, "3p 3p"],
     ) -> list[float]:
-        """Return s_k² of a light whose u has a Gaussian posterior, by one step of expectation maximisation.
+        """Return the likeliest factors s_k² of a light's covariance, by one step of expectation maximisation.
+
+        The posterior of the light's u is Gaussian.
 
         The prior on s_k² is (4).
 

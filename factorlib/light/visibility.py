@@ -31,7 +31,7 @@ def widest_sharpness(count: int) -> float:
 
 
 def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"]) -> Float[Tensor, "n k"]:
-    """Return f of equation (1), normalised to a sum of 1 in each row."""
+    """Return the weights of directions in diffuse reflection, f of (1), normalised to a sum of 1 in each row."""
     cosine = (normals @ directions.T).clamp_min(0)
     return cosine / cosine.sum(1, keepdim=True).clamp_min(1e-12)
 
@@ -39,7 +39,7 @@ def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3
 def highlight_weights(
     normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"], roughness: float
 ) -> Float[Tensor, "n k"]:
-    """Return f of equation (2), normalised to a sum of 1 in each row.
+    """Return the weights of directions in specular reflection, f of (2), normalised to a sum of 1 in each row.
 
     Args:
         normals: n of the points, unit.
@@ -64,7 +64,7 @@ def highlight_weights(
 def kernel(
     directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, " p"]
 ) -> Float[Tensor, "k p"]:
-    """Return L of (1) and (2): lobes at the directions, widened, and at least e^FAINTEST.
+    """Return the values of widened lobes at directions, L of (1) and (2), at least e^FAINTEST.
 
     Args:
         directions: d_k, unit.
@@ -76,7 +76,7 @@ def kernel(
 
 
 def widened_sharpness(sharpness: Float[Tensor, " p"], count: int) -> Float[Tensor, " p"]:
-    """Return κ of lobes sampled at `count` directions."""
+    """Return κ, the sharpness of lobes that are widened for sampling at `count` directions."""
     return 1 / (1 / sharpness + 1 / widest_sharpness(count))
 
 

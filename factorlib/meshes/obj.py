@@ -54,7 +54,7 @@ class _Tables:
             self.part.append(part)
 
     def soup(self) -> TriangleSoup:
-        """Return the triangles."""
+        """Return the triangles of the whole file."""
         normals = np.concatenate([np.array(self.coordinates["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
         index = np.array(self.face_normals, dtype=np.int64).reshape(-1, 3)
         index[(index < 0) | (index >= len(normals))] = len(normals) - 1

@@ -143,7 +143,7 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
 
 
 def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
-    """Check a soup and return it.
+    """Check that triangles read from a file make a usable shape, and return them.
 
     Raises:
         InputError: If it has no faces, an index out of range, a vertex that is not finite, or a size or position that
@@ -166,7 +166,7 @@ def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     bad = ~np.isfinite(soup.vertices).all(axis=1)
     if bad.any():
         refuse(
-            f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}",
+            f"{int(bad.sum())} vertices are not finite; the first is number {int(np.argmax(bad)) + 1}",
             "remove them in a mesh editor, or export the mesh again",
         )
     corners = soup.vertices[soup.faces.reshape(-1)]

@@ -98,7 +98,7 @@ def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal)
     if recipe.sun is None:
         return
     if isinstance(recipe, kinds.RelightRecipe):
-        refuse("sun", "a recipe of kind relight takes its lights from `lights`", "remove `sun`: leave it out")
+        refuse("sun", "a recipe of kind relight takes its lights from `lights`", "remove `sun`")
     if len(recipe.photos) != 1:
         refuse(
             "sun.direction",

@@ -169,7 +169,7 @@ class Solid(Caster):
 
 
 class FreeSpace:
-    """Free space on the ground for a new object about its spot."""
+    """Search for a place on the ground near a spot where a new object is free and visible."""
 
     def __init__(self, scene: PhotoScene, new: PlacedMesh, spot: Spot):
         self.camera = scene.camera
@@ -258,7 +258,7 @@ def free_placement(
             small = msgspec.structs.replace(spot, height=share * spot.height)
             smaller = FreeSpace(scene, stand(small), small)
             if (move := smaller.nearest_move()) is not None:
-                cure = f"at {share} of its size it is free at {smaller.pixel_text(move, factor)}"
+                cure = f"make it smaller: at {share} of its size it fits at {smaller.pixel_text(move, factor)}"
                 break
         raise InputError(
             f"the new object has no free place in the picture: {reason}", key="at" if asked else "size", cure=cure

@@ -60,11 +60,11 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         return reader(path)
 
     def rgb(self, stage: str, name: str) -> Picture | None:
-        """Return the linear radiance of <name>.exr."""
+        """Return the linear radiance of <name>.exr in a stage's result; None if it does not exist."""
         return self.read(read_rgb_exr, stage, f"{name}.exr")
 
     def channels(self, stage: str, name: str) -> Channels:
-        """Return all channels of <name>.exr, which must exist."""
+        """Return all channels of <name>.exr in a stage's result, which must exist."""
         channels = self.read(read_exr, stage, f"{name}.exr")
         assert channels is not None
         return channels
@@ -101,7 +101,7 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def metrics(self) -> Metrics | None:
-        """Errors from `evaluate`."""
+        """Errors of the result from `evaluate`; None if that has not run."""
         return self.read(read_metrics, "evaluate", "metrics.json")
 
     def illumination_of(self, photo: str) -> str:

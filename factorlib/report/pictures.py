@@ -83,7 +83,7 @@ def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndarray, "n n 4"]:
-    """Return display values, transparent outside the disc that fills the picture."""
+    """Return the display values of a ball that fills the picture, transparent around it."""
     height, width = radiance.shape[:2]
     y, x = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (height, width))
     alpha = np.clip((1 - np.hypot(x[None], y[:, None])) * height / 2 + 0.5, 0, 1)

@@ -190,7 +190,7 @@ class MaterialTable(msgspec.Struct, frozen=True):
 
 
 class Misfit(msgspec.Struct, frozen=True):
-    """Misfit of a photo.
+    """Shares of a photo that the solution leaves unexplained, and that are clipped.
 
     Attributes:
         unexplained: share of the photo's shading that is not explained (`factorlib.inference.misfit`)

@@ -28,7 +28,7 @@ from factorlib.results.materials import Reflectance, Vec3
 
 
 class Counts(msgspec.Struct, frozen=True):
-    """Counts of the set.
+    """Numbers of photos, materials, illuminations and connected components of the set.
 
     Attributes:
         components: groups of photos that share no material
@@ -41,7 +41,7 @@ class Counts(msgspec.Struct, frozen=True):
 
 
 class PictureError(msgspec.Struct, frozen=True):
-    """Errors of a picture.
+    """Errors of a picture against the true one.
 
     Attributes:
         psnr_linear_db: dB, higher is better
@@ -58,7 +58,7 @@ Error = TypeVar("Error")
 
 
 class Scored(msgspec.Struct, Generic[Error], frozen=True):
-    """Error of an estimate, and that of a null."""
+    """Error of an estimate, and error of a null, the trivial guess that it must beat."""
 
     estimate: Error
     null: Error

@@ -29,7 +29,7 @@ class PoseEntry(msgspec.Struct, frozen=True):
 
     @property
     def pose(self) -> Pose:
-        """The pose as arrays."""
+        """The pose cam_from_object as arrays."""
         return Pose(np.array(self.rotation), np.array(self.translation))
 
 
@@ -86,7 +86,7 @@ class CameraEntry(msgspec.Struct, frozen=True):
     factor: Annotated[int, msgspec.Meta(ge=1)] = 1
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return the camera of a picture of that many pixels."""
+        """Return the camera of a picture of `width` × `height` pixels."""
         return Camera(width, height, self.focal_px, self.principal_point)
 
 

@@ -15,7 +15,7 @@ CURE = "name the folder of a result of `solve`, as it was written"
 
 
 class Earlier(msgspec.Struct, frozen=True):
-    """An earlier solution.
+    """An earlier solution, from which a solve starts.
 
     Attributes:
         lights: in scene radiance, by illumination

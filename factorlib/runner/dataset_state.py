@@ -150,7 +150,7 @@ class DatasetState:
 
 
 def read_state(project: Project, request: Request, look: bool = False) -> DatasetState:
-    """Read everything that a plan needs.
+    """Read pipeline, settings, dataset, recipes and store, from which a plan is made.
 
     Args:
         project: the project

@@ -145,5 +145,5 @@ class Display:
         self._bars.update(self._rows[stage], completed=done, total=total, count=f"{total - left}/{total}", words=words)
 
     def close(self) -> None:
-        """Release the terminal."""
+        """Remove the bars and release the terminal."""
         self._bars.stop()

@@ -60,7 +60,11 @@ class Data(msgspec.Struct, frozen=True):
 
 
 class Provider(NamedTuple):
-    """Reader of datasets, and the names of their slices."""
+    """Reader of datasets for the runner.
+
+    slices: names of the slices that a dataset has
+    read:   function of a dataset's folder
+    """
 
     slices: tuple[str, ...]
     read: Callable[[Path], Data]
@@ -73,7 +77,7 @@ def restore_sigterm() -> None:
 
 
 def photo_sets() -> Provider:
-    """Return the provider of the project's own datasets."""
+    """Return the reader of datasets with a dataset.yaml."""
     from factorlib.dataset.read import read_dataset
     from factorlib.dataset.slices import SLICES, dataset_slice
 
@@ -176,7 +180,7 @@ class Project(msgspec.Struct, frozen=True):
         return None
 
     def recipes(self, data: Data, words: Sequence[str]) -> dict[str, Recipe]:
-        """Read recipes, by name.
+        """Read the recipes that `words` name; return them by name.
 
         Each word is a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
 
@@ -300,7 +304,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def values(self) -> dict[str, Any]:
-        """Parameters without those that name a folder."""
+        """Parameters of the stage's `Params`: all but those that name a folder."""
         return {name: value for name, value in self.params.items() if name not in self.given}
 
     @property
@@ -325,7 +329,7 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return list(TopologicalSorter({name: stage.upstream for name, stage in self.stages.items()}).static_order())
 
     def check(self, stages: Sequence[str]) -> None:
-        """Raise InputError for a name that is not a stage's."""
+        """Raise InputError for a name in `stages` that no stage has."""
         for name in (name for name in stages if name not in self.stages):
             near = did_you_mean(name, self.stages)
             cure = near if near.startswith("did") else "make help-all lists all verbs and stages"

@@ -129,7 +129,7 @@ def _identity(path: Path) -> list[int]:
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """Result of a key.
+    """Stored result of a key: its files, the record it was made from, its cost and warnings.
 
     Attributes:
         output: hash of the tree

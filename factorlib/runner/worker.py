@@ -264,7 +264,7 @@ class Events(logging.Handler):
             logger.propagate = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Record a warning."""
+        """Write a warning to the file of events, and remember it for the result."""
         text = record.getMessage().strip()
         if text not in self.warnings:
             self.warnings.append(text)
@@ -277,7 +277,7 @@ class Events(logging.Handler):
             self._write({"done": float(done), "total": float(total), "text": text})
 
     def report(self, text: str) -> None:
-        """Report a warning that is not part of the result's log."""
+        """Write a warning to the file of events alone, not to the log of the result."""
         self._write({"warning": text})
 
     def _write(self, event: dict) -> None:

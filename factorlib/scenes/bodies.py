@@ -65,7 +65,7 @@ def hook() -> list[Part]:
 
 
 def stack() -> list[Part]:
-    """Return three boxes."""
+    """Return three stacked boxes, each turned and moved."""
     return [_box(np.array(size), np.array(place, float), turn) for size, place, turn in BOXES]
 
 

@@ -164,7 +164,7 @@ def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"],
 
 
 def signed_distance(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray, " n"]:
-    """Return f at points of the object's frame, in its units; points behind a camera are outside."""
+    """Return the signed distance f at points of the object's frame, in its units; behind a camera is outside."""
     least = np.full(len(points), np.inf)
     for outline in outlines:
         x, y, z = outline.known_pose.apply(points).T

@@ -307,7 +307,7 @@ def carve(outlines: Sequence[Outline], poses: Sequence[BodyView], span: tuple[fl
 
 
 def largest_discs(outline: Outline, body: BodyView, heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return r(z) of (1) for one outline, in the body's units.
+    """Return the radii r(z) of (1) of the largest discs that fit into one outline, in the body's units.
 
     Args:
         outline: The outline.

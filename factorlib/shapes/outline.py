@@ -17,7 +17,7 @@ FREE = 1e9  # signed distance of places that the photo does not show, pixels: fa
 
 
 class Outline(msgspec.Struct, frozen=True, dict=True):
-    """Object in a photo.
+    """Outline of an object in a photo, with the camera and, if it is known, the pose.
 
     part          [h, w] number of the object's part that a pixel shows, from 1; 0 background, −1 unknown
     camera        the photo's camera at its most probable focal length
@@ -44,7 +44,7 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
 
     @property
     def known_pose(self) -> Pose:
-        """The pose of an outline that has one; ValueError for another."""
+        """The pose; ValueError for an outline without one."""
         if self.pose is None:
             raise ValueError(f"the outline in '{self.photo}' has no pose")
         return self.pose

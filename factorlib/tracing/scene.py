@@ -154,7 +154,7 @@ def sensor(
 
 
 class Channels(msgspec.Struct, frozen=True):
-    """Choice of the light and the channels of a rendering.
+    """Choice of the further contents of a rendering: the light itself, and guides of a denoiser.
 
     Attributes:
         hide_emitters: hide the light itself, where alpha is then 0

@@ -49,7 +49,7 @@ def _fastest() -> str:
         if library and _runs(library):
             os.environ[LIBRARY] = library
             return "llvm_ad_rgb"
-    needed = "no LLVM that Mitsuba runs with (16 or later; Debian: libllvm19)"
+    needed = "no LLVM that Mitsuba can use is installed (16 or later; Debian: libllvm19)"
     log.warning("%s: rendering with scalar_rgb, about 3 times slower", needed)
     return "scalar_rgb"
 

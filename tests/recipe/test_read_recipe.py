@@ -68,7 +68,7 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: view\nphotos: [hall]\nsun: {direction: [0, 0, 0], strength: 0.5}", ["sun.direction", "no length"]),
     ("kind: view\nphotos: [hall]\nsun: {direction: [0, 1, 0], strength: 60}", ["sun.strength", "<= 1"]),
     ("kind: view\nphotos: [hall]\nsun: {direction: [0, 1, 0]}", ["sun", "strength"]),
-    ("kind: relight\nphotos: [hall]\nsun: {direction: [0, 1, 0], strength: 0.5}", ["sun", "leave it out"]),
+    ("kind: relight\nphotos: [hall]\nsun: {direction: [0, 1, 0], strength: 0.5}", ["sun", "remove `sun`"]),
     ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
 ])  # fmt: skip
 def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):

@@ -396,7 +396,7 @@ def test_an_object_that_fits_nowhere_is_refused_with_a_size_that_does():
         spot,
         asked=False,
     )
-    assert error.key == "size" and "of its size it is free at `at: [" in error.cure
+    assert error.key == "size" and "of its size it fits at `at: [" in error.cure
 
 
 # ── Mitsuba's scenes agree with the project's frames and reflectance model ──────────────────────────────────────────

@@ -33,7 +33,7 @@ Nine = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Num
 
 
 class FrameCamera(msgspec.Struct, frozen=True):
-    """The camera of all frames, or of one; pixels, centres at 0.5."""
+    """Intrinsics that all frames share, or those of one frame, in pixels with centres at 0.5."""
 
     camera_model: str | None = None
     is_fisheye: bool | None = None
@@ -53,7 +53,7 @@ class FrameCamera(msgspec.Struct, frozen=True):
 
 
 class Frame(FrameCamera, frozen=True, kw_only=True):
-    """A frame; transform_matrix is world_from_camera, OpenGL, with 3 or 4 rows."""
+    """An image and its camera; transform_matrix is world_from_camera in OpenGL's axes, with 3 or 4 rows."""
 
     file_path: str
     transform_matrix: list[Row4]
