@@ -63,7 +63,7 @@ class Validation:
         return _faults([*lights, *(partial(read_parts, p) for p in files.values() if p.suffix.lower() in MESHES)])
 
     def cautions(self) -> list[str]:
-        """Warn if the lights fall into groups without a shared material.
+        """Return a warning if the lights fall into groups without a shared material.
 
         Brightness and colour cannot be compared between such groups.
         """

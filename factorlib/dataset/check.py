@@ -403,7 +403,7 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         refuse.when(
             max(distances) < LEAST_OFF_LINE * math.hypot(*longest),
             key,
-            f"each {name} lies on one line",
+            f"all {name}s lie on one line",
             "add a keypoint away from that line, about which the object could rotate",
         )
 

@@ -27,7 +27,7 @@ SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 class Asset(msgspec.Struct, frozen=True):
-    """Version of glTF."""
+    """Version of glTF that a file has."""
 
     version: str
 

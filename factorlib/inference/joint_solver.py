@@ -87,7 +87,7 @@ def solve(
 
 
 def initial_fits(problem: JointProblem, start: Start, options: SolveOptions) -> list[Fit]:
-    """Return the initial fits of the first trial."""
+    """Return the initial fits from which the choice of shadows starts."""
     problem = reliable_observations(problem)
     fits = start(problem, min(TRIAL_CELLS, options.cells))
     return [msgspec.structs.replace(fit, point=insert_known(fit.point, problem)) for fit in fits]

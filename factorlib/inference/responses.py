@@ -169,7 +169,7 @@ class Responses(NamedTuple):
         return np.tensordot(weights.astype(np.float32), self.stack[1:], axes=1)
 
     def radiance(self, weight: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "3 n 3"]:
-        """Return D w, S w and (∂S/∂roughness) w, without forming S."""
+        """Return the responses to lobes of weights w: D w, S w and (∂S/∂roughness) w, without forming S."""
         nodes, n, p = self.stack.shape
         sums = (self.stack.reshape(-1, p) @ weight.astype(np.float32)).reshape(nodes, 3 * n).astype(float)
         return np.stack([sums[0], self.share @ sums[1:], self.slope @ sums[1:]]).reshape(3, n, 3)

@@ -192,7 +192,7 @@ BAD = [
     ("photos[0].objects[0].pose > .rotation", {**POSE, "rotation": MIRROR}, "reflection"),
     ("photos[0].objects[0].pose > .translation[1]", {**POSE, "translation": [0, NAN, 1]}, "finite"),
     (K0, KEYPOINTS[:3], "give 4 or more"),
-    (K0, ON_A_LINE, "each point lies on one line"),
+    (K0, ON_A_LINE, "all points lie on one line"),
     (f"{K0} > [4].pixel", [*KEYPOINTS, {"pixel": KEYPOINTS[1]["pixel"], "point": [9, 9, 9]}], "keypoints[1]"),
     (f"{K0} > [3].pixel[1]", [*KEYPOINTS[:3], {"pixel": [9, NAN], "point": [0, 0, 1]}], "finite"),
     ("photos[0].objects[1].keypoints", KEYPOINTS, "keep one"),
