@@ -79,9 +79,7 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
         fault = f"{lost} pixels are NaN, infinite or above {LARGEST:g}"
         raise InputError(fault, file=path, key=key, cure="replace these pixels, or export the map again")
     if least < LEAST * total / (3 * height * width):
-        cure = (
-            "set negative values, which some resampling filters make, to 0, or export the map again as linear radiance"
-        )
+        cure = "set negative values to 0 (some resampling filters make them), or export the map again, linear"
         raise InputError(f"has a radiance of {least:.4g}, less than 0", file=path, key=key, cure=cure)
     if not (radiance > 0).any():
         raise InputError("the map is black", file=path, key=key, cure="name another map, or export this one again")

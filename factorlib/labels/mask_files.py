@@ -202,9 +202,9 @@ def read_coco(
             shapes += [(place, counts) for counts in runs]
             length += longer
             if length > LONGEST_TOGETHER * sum(size):
-                most = LONGEST_TOGETHER * sum(size)
-                fault = f"the outlines of this photo are {length:.3g} pixels long together; at most {most:,} are read"
-                raise InputError(fault, file=path, key=place, cure=SIMPLER)
+                raise InputError(
+                    f"all outlines together are {length:.3g} pixels long", file=path, key=place, cure=SIMPLER
+                )
         masks[name] = _union(shapes, size, path)
     return masks
 

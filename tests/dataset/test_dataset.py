@@ -253,7 +253,7 @@ def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(fold
     }
     caught = refusal("2 photos of unknown exposure", read_dataset, write(folder, spec))
     spec["known"]["exposure"] = {"kitchen": 1.0}
-    refusal("'hall' shares the light of this one, but has no exposure", read_dataset, write(folder, spec))
+    refusal("'hall', of the same light, has none", read_dataset, write(folder, spec))
     spec["known"]["exposure"]["hall"] = -1
     known = dataset_slice(read_dataset(write(folder, spec)), "known")
     assert caught.key == "known.illumination.kitchen.chrome" and known.files == ["garden.exr"]

@@ -332,7 +332,7 @@ REFUSED = {
     ],
     ("mask", "coco.json"): [
         *(coco(shape) for shape in BAD_SHAPES), (coco([ZIGZAG]), "pixels long"),
-        (coco(*WALLS), "pixels long together"),
+        (coco(*WALLS), "all outlines together are"),
         *(coco([[2, 2, 8, 2, 8, 8]], image=i) for i in ({"file_name": 5}, {"id": None}, {"width": 10**15})), *JSONS,
         '{"images": 5}',
     ],

@@ -166,11 +166,7 @@ def _poses(
     scales = sorted({similarity.scale for similarity in placed.values()})
     if len(scales) > 1:
         fault = f"photo {photo.name!r} has objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
-        refuse(
-            "cameras.world_from_object",
-            fault,
-            "scale the mesh files so that all objects of a photo have the same scale",
-        )
+        refuse("cameras.world_from_object", fault, "scale the mesh files so that a photo's objects have one scale")
     for name, similarity in placed.items():  # The mesh's unit replaces the source's, which changes no picture.
         assert image.cam_from_world is not None  # only bop has no world
         cam_from_object = image.cam_from_world * rigid(similarity.rotation, similarity.translation)
