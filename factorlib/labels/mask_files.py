@@ -202,9 +202,7 @@ def read_coco(
             shapes += [(place, counts) for counts in runs]
             length += longer
             if length > LONGEST_TOGETHER * sum(size):
-                raise InputError(
-                    f"all outlines together are {length:.3g} pixels long", file=path, key=place, cure=SIMPLER
-                )
+                raise InputError(f"all outlines together are {length:.3g} px long", file=path, key=place, cure=SIMPLER)
         masks[name] = _union(shapes, size, path)
     return masks
 

@@ -129,7 +129,7 @@ def test_a_photo_that_is_black_or_negative_wherever_it_is_used_and_a_pipe_are_re
         photo = read_photo(save(tmp_path / "kitchen.exr", pixels))
         check_bright(photo, np.ones((4, 6), bool), "kitchen.exr")
         caught = refusal("black, or less than 0", check_bright, photo, inside, "kitchen.exr", "photos[kitchen].image")
-        assert "kitchen.exr: photos[kitchen].image" in str(caught) and "drop the photo" in caught.cure
+        assert "kitchen.exr: photos[kitchen].image" in str(caught) and "remove the photo" in caught.cure
     os.mkfifo(tmp_path / "pipe.exr")
     for read in (read_exr, read_light_map):
         refusal("is a pipe", read, tmp_path / "pipe.exr")

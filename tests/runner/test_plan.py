@@ -149,7 +149,7 @@ def test_a_stage_whose_slice_says_nothing_is_not_there_and_none_takes_its_result
         ("over: photo", "over: mesh", ["stages.one.over"]),
         ("[dataset.photo]", "[two]", ["need each other", "one"]),
         ("threads: 2", "when: sett", ["stages.two.when", "did you mean 'set'"]),
-        ("format: 1", "format: 2", ["pipeline.yaml:1: format: ", "write one of 1"]),
+        ("format: 1", "format: 2", ["pipeline.yaml:1: format: ", "write 1"]),
     ],
 )
 def test_what_is_refused(tmp_path, old, new, words):

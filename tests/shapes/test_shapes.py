@@ -87,7 +87,7 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
     one = outline(BLOB, AROUND[3], False)
     x, y = np.meshgrid(np.arange(320), np.arange(240))
     triangle = ((x > 60) & (y > 60) & (x - 60 + 1.7 * (y - 60) < 230)).astype(int)
-    refusal("mirrored onto itself", body_of_revolution, [msgspec.structs.replace(one, part=triangle)])
+    refusal("mirror-symmetric", body_of_revolution, [msgspec.structs.replace(one, part=triangle)])
     bent = trimesh.creation.box((1.0, 0.2, 0.2)) + trimesh.creation.box((0.2, 0.6, 0.2)).apply_translation(
         (0.4, 0.3, 0)
     )
