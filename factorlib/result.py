@@ -38,7 +38,7 @@ from factorlib.pack import check_whole
 from factorlib.reading import check_plain
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
-from factorlib.recipe.read import check_recipe, files_of
+from factorlib.recipe.read_recipe import check_recipe, files_of
 from factorlib.render.photo_scene import DistantLight, Orbit, PhotoScene, TracedPicture, as_it_is, resized, traced_photo
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet

@@ -20,8 +20,8 @@ from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
-from factorlib.labels.labels import check_materials, read_labels, read_objects
-from factorlib.meshes.read import part_labels, read_mesh, read_parts
+from factorlib.labels.label_image import check_materials, read_labels, read_objects
+from factorlib.meshes.read_mesh import part_labels, read_mesh, read_parts
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.recipe.kinds import is_light_file
 from factorlib.yamlfile import convert

@@ -25,7 +25,7 @@ from factorlib.images.lens import radial_lens
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import scaled
-from factorlib.meshes.read import CREASE_DEG, read_mesh
+from factorlib.meshes.read_mesh import CREASE_DEG, read_mesh
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectPose, PhotoPoses, entry_of, read_poses

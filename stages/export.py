@@ -43,7 +43,7 @@ from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply_stl_off import write_ply
-from factorlib.meshes.read import CREASE_DEG
+from factorlib.meshes.read_mesh import CREASE_DEG
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, Reflectance, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses

@@ -20,7 +20,7 @@ from factorlib.images.photo import Photo, box_majority, check_bright, decoded, l
 from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
-from factorlib.labels.labels import Labels, read_labels, read_objects
+from factorlib.labels.label_image import Labels, read_labels, read_objects
 from factorlib.results.photos import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 

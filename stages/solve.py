@@ -45,7 +45,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Name
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.solution import Earlier, read_earlier
-from factorlib.results.surface import BEGINNING
+from factorlib.results.surface_table import BEGINNING
 from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
 

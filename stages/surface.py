@@ -31,12 +31,12 @@ from factorlib.inference.surface_turns import (
     zero_detail,
 )
 from factorlib.jsonfile import write_json
-from factorlib.meshes.read import CREASE_DEG, MeshCache
+from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import BEGINNING, FILE, SurfaceTable, Tried
+from factorlib.results.surface_table import BEGINNING, FILE, SurfaceTable, Tried
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (

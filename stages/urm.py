@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.geometry.visibility import Occluders
+from factorlib.geometry.occlusion import Occluders
 from factorlib.images.exr import read_exr
 from factorlib.meshes.mesh import scaled
-from factorlib.meshes.read import CREASE_DEG, MeshCache
+from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress

@@ -32,7 +32,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 from factorlib import load_result
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError
 from factorlib.evaluate.truth import read_true_light

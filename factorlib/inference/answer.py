@@ -18,9 +18,9 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.fit_runner import Solution
 from factorlib.inference.gauge import DETERMINED, GIVEN, RULE, UP_TO_SCALE, connected_components
 from factorlib.inference.lights import Light
+from factorlib.inference.material_prior import likeliest_class
 from factorlib.inference.materials import LEAST_REFLECTANCE, Materials
 from factorlib.inference.misfit import unexplained_shares
-from factorlib.inference.priors import likeliest_class
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.uncertainty import ABSOLUTE, GAUGE, MaterialErrors
 from factorlib.light.lobes import Lobes

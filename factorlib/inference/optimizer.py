@@ -31,8 +31,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.inference.lights import TONE_RANGE, Light
 from factorlib.inference.likelihood import LightLikelihood, System, solve_cholesky
+from factorlib.inference.material_prior import MaterialPrior, PriorTerms, materials_from_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
-from factorlib.inference.priors import MaterialPrior, PriorTerms, materials_from_unknowns
 from factorlib.inference.problem import Spread
 
 FLOOR = 1e-9  # share of the largest diagonal entry that is added to every diagonal entry

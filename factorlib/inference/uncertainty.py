@@ -48,9 +48,9 @@ from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.joint_solver import LIGHT_OBSERVATION_FACTOR
 from factorlib.inference.likelihood import System, cholesky_factor, cholesky_inverse, solve_cholesky
+from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.priors import material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
 from factorlib.light.prior import LightPrior, read_light_prior

@@ -28,7 +28,7 @@ from PIL import Image
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal, file_exists
-from factorlib.dataset.read import FILE, UNKNOWN
+from factorlib.dataset.read_dataset import FILE, UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
 from factorlib.images.photo import decoded, open_photo

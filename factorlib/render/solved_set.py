@@ -16,7 +16,7 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, scaled
-from factorlib.meshes.read import CREASE_DEG, MeshCache, read_mesh
+from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
@@ -25,7 +25,7 @@ from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, T
 from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import read_surface
+from factorlib.results.surface_table import read_surface
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import rigid
 

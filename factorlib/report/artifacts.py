@@ -17,7 +17,7 @@ from factorlib.results.materials import MaterialTable, Solved, read_exposures, r
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import SurfaceTable, read_surface
+from factorlib.results.surface_table import SurfaceTable, read_surface
 
 STAGES = ["masks", "align", "urm", "surface", "train", "solve", "export", "render", "evaluate"]
 

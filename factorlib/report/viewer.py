@@ -20,9 +20,9 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.gltf_writer import read_part_materials, variant_name
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
+from factorlib.geometry.occlusion import LIFT, Occluders, SurfacePoints
 from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.geometry.visibility import LIFT, Occluders, SurfacePoints
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.subdivision import subdivide

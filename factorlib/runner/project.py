@@ -74,7 +74,7 @@ def restore_sigterm() -> None:
 
 def photo_sets() -> Provider:
     """Return the provider of the project's own datasets."""
-    from factorlib.dataset.read import read_dataset
+    from factorlib.dataset.read_dataset import read_dataset
     from factorlib.dataset.slices import SLICES, dataset_slice
 
     def read(path: Path) -> Data:
@@ -84,7 +84,7 @@ def photo_sets() -> Provider:
 
         def recipe(file: Path) -> Recipe:
             """Read a recipe."""
-            from factorlib.recipe.read import files_of, read_recipe
+            from factorlib.recipe.read_recipe import files_of, read_recipe
 
             content = read_recipe(file, dataset)
             return Recipe(msgspec.to_builtins(content), files_of(content, file))

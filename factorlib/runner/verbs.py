@@ -241,7 +241,7 @@ def _draw_sheet(project: Project, folder: Path) -> None:
     with contextlib.closing(Display()) as display:
         display.start(step)
         progress = partial(display.progress, step, text="")
-        import_module("factorlib.sheet").write_sheet(folder, path, progress)  # by name: it is science
+        import_module("factorlib.contact_sheet").write_sheet(folder, path, progress)  # by name: it is science
     print(f"  contact sheet: {project.short_path(path)}")
 
 
@@ -252,7 +252,7 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
         raise InputError("no folder of photos is named", key="PHOTOS", cure=cure)
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
-    missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
+    missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
     rest = "; still missing, or yours to decide:" if missing else ""
     print(f"{project.short_path(folder)}/dataset.yaml is written{rest}")
     for line in missing:

@@ -22,7 +22,7 @@ from factorlib.generate.chair import dowel, legs, shell
 from factorlib.generate.solids import BUMPS, revolved
 from factorlib.geometry import open3d as o3d
 from factorlib.meshes.mesh import Mesh, closed_grid
-from factorlib.meshes.read import CREASE_DEG, usable
+from factorlib.meshes.read_mesh import CREASE_DEG, usable
 from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
 
 Part = tuple[np.ndarray, np.ndarray, int]  # vertices [V, 3], faces [F, 3], label

@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from factorlib.errors import InputError
-from factorlib.inference.priors import Classes, MaterialClass
+from factorlib.inference.material_prior import Classes, MaterialClass
 from factorlib.jsonfile import json_text, write_json
 from factorlib.reading import read_bytes, reading
 

@@ -21,13 +21,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.coarse import rotation_to_ray
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import read_result
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import PhotoPoses, read_photo_poses
 from factorlib.scenes.stage_runs import run_stages

@@ -18,7 +18,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import SUN, Lobes, lobe_integral
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobe_table import write_lobes
 from factorlib.stage import Inputs

@@ -21,7 +21,7 @@ from factorlib.geometry.camera import Camera
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply_stl_off import submesh, write_ply
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.reflection.reference import Reference
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
 from factorlib.render.resynthesis import Reflector, resynthesised

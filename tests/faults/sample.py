@@ -19,15 +19,15 @@ import msgspec
 import numpy as np
 import yaml
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import PhotoSlice
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.jsonfile import read_json
-from factorlib.labels.labels import read_labels
+from factorlib.labels.label_image import read_labels
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.poses import read_poses
 from factorlib.results.solution import read_earlier

@@ -33,14 +33,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.errors import InputError
 from factorlib.images.exr import encoded, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.read import read_mesh
-from factorlib.recipe.read import read_recipe
+from factorlib.meshes.read_mesh import read_mesh
+from factorlib.recipe.read_recipe import read_recipe
 from factorlib.reflection.network import Layers, write_layers
 from factorlib.results.lobe_table import write_lobes
 from factorlib.runner import verbs

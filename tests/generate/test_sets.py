@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.generate import eames, folder, surroundings, synthetic
 from factorlib.generate.chair import chair, labelled
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
 from factorlib.light.latlong import sample_map
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from tests.refusal import refusal
 from tests.runner.toy import files_of
 

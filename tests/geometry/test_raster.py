@@ -7,9 +7,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.occlusion import Occluders, SurfacePoints
 from factorlib.geometry.raster import rasterise
 from factorlib.geometry.sphere import BINS, NO_OCCLUDER, fibonacci_sphere, mirror_directions
-from factorlib.geometry.visibility import Occluders, SurfacePoints
 from tests.align.scenes import ball, blob, mesh_of, photo_of
 
 CAMERA = Camera(64, 48, 80.0, (30.0, 25.0))

@@ -16,10 +16,10 @@ from factorlib.inference.fit import (
 )
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import cholesky_factor
+from factorlib.inference.material_prior import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, MaterialPrior, material_unknowns
 from factorlib.inference.materials import Materials
 from factorlib.inference.optimizer import Arrow, Descent, determinant_terms
 from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve
-from factorlib.inference.priors import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, MaterialPrior, material_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import MATERIALS, block, factor_between, random_light

@@ -13,10 +13,10 @@ from factorlib.inference.gauge import BRIGHTEST, fix_gauge
 from factorlib.inference.identifiability import tinted_alike
 from factorlib.inference.known import KnownValues, light_from_ball, light_from_map
 from factorlib.inference.lights import Light
+from factorlib.inference.material_prior import MaterialPrior, PriorTerms, material_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, Point
 from factorlib.inference.misfit import unexplained_shares
 from factorlib.inference.optimizer import Descent, step_light
-from factorlib.inference.priors import MaterialPrior, PriorTerms, material_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import insert_known
 from factorlib.inference.uncertainty import LARGEST_RELATIVE_ERROR, Posterior, project_to_gauge

@@ -10,8 +10,7 @@ from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.forward import Illumination
 from factorlib.inference.likelihood import EXPOSURE_DEVIATION, TONE_DEVIATION
-from factorlib.inference.materials import Materials
-from factorlib.inference.priors import (
+from factorlib.inference.material_prior import (
     MaterialPrior,
     Mixture,
     likeliest_class,
@@ -19,6 +18,7 @@ from factorlib.inference.priors import (
     materials_from_unknowns,
     shipped_classes,
 )
+from factorlib.inference.materials import Materials
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.responses import ResponseTable
 from factorlib.scenes.joint_problems import MATERIALS, block

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.meshes.mesh import Mesh, area_vectors, consistently_wound, corner_normals
 from factorlib.meshes.ply_stl_off import submesh, write_ply
-from factorlib.meshes.read import merged_normals, read_mesh, usable
+from factorlib.meshes.read_mesh import merged_normals, read_mesh, usable
 from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
 from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals
 from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put

@@ -5,10 +5,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.jsonfile import write_json
 from factorlib.recipe.kinds import KINDS, InsertRecipe, recipe_of
-from factorlib.recipe.read import files_of, read_recipe
+from factorlib.recipe.read_recipe import files_of, read_recipe
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
@@ -87,7 +87,7 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
 
 
 def test_a_denoiser_that_is_not_installed_is_refused_with_the_cure(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("factorlib.recipe.read.find_spec", lambda name: None)
+    monkeypatch.setattr("factorlib.recipe.read_recipe.find_spec", lambda name: None)
     error = refusal(r"denoise.*not installed", read_recipe, written(tmp_path, "kind: view\ndenoise: true"), dataset)
     assert "make setup EXTRAS=denoise" in str(error)
     assert not read_recipe(written(tmp_path, "kind: view\ndenoise: false"), dataset).denoise

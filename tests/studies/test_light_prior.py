@@ -11,7 +11,7 @@ from scipy.optimize import approx_fprime
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import write_rgb_exr
-from factorlib.inference.priors import Classes
+from factorlib.inference.material_prior import Classes
 from factorlib.jsonfile import read_json
 from factorlib.light.prior import LightPrior, angles
 from studies.measured import light_prior, material_classes

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageColor, ImageDraw
 
-from factorlib.dataset.read import FILE, OPEN, UNKNOWN, read_draft
+from factorlib.dataset.read_dataset import FILE, OPEN, UNKNOWN, read_draft
 from factorlib.dataset.schema import DatasetFile, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
@@ -24,9 +24,9 @@ from factorlib.images.photo import decoded, open_photo
 from factorlib.images.picture import nearest_tags, picture, png_bytes
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.tone import srgb_decode
-from factorlib.labels.labels import Labels, read_labels
+from factorlib.labels.label_image import Labels, read_labels
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.reading import path_inside
 from factorlib.wholefile import write_bytes
 

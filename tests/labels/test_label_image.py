@@ -9,7 +9,7 @@ from PIL import Image
 from pycocotools import mask as pycocomask
 
 from factorlib.labels.grow import grow
-from factorlib.labels.labels import Labels, check_materials, read_labels, read_objects
+from factorlib.labels.label_image import Labels, check_materials, read_labels, read_objects
 from factorlib.labels.mask_files import read_values, run_lengths
 from tests.refusal import refusal
 

@@ -28,14 +28,14 @@ from factorlib.align.coarse import HIDDEN, match_parts
 from factorlib.align.silhouette import UNKNOWN as HIDES
 from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
-from factorlib.dataset.read import UNKNOWN
+from factorlib.dataset.read_dataset import UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME, MAX_MATERIALS
 from factorlib.errors import InputError
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
-from factorlib.labels.labels import read_labels
+from factorlib.labels.label_image import read_labels
 from factorlib.labels.mask_files import Category, read_inside, read_values
-from factorlib.meshes.read import read_mesh, read_parts
+from factorlib.meshes.read_mesh import read_mesh, read_parts
 from factorlib.reading import read_bytes, reading
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
