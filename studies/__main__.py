@@ -14,7 +14,8 @@ import typer
 from factorlib.__main__ import confirm, raise_on_signals, switched_on
 from factorlib.errors import InputError, did_you_mean
 from factorlib.wholefile import disk_error
-from studies.run import STUDIES, collect, forget, make, studies
+from studies.catalogue import STUDIES
+from studies.run import collect, forget, make, studies
 from studies.study import FULL, QUICK
 
 

@@ -6,9 +6,7 @@
     recipes/      links to the current pictures of each recipe
     dataset.txt   the dataset; only a folder with this file was made by the runner
 
-A view, in store/views, has the files of all photos of a stage in one folder, as hard links.  Each run has a folder in
-store/tmp and holds a lock in it while it lives.  The operating system frees the lock of a killed run, so its folder can
-be deleted, and there is no unlock command.
+A view, in store/views, has the files of all photos of a stage in one folder, as hard links.
 """
 
 from __future__ import annotations
@@ -19,9 +17,8 @@ import shlex
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -29,21 +26,9 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.plan import Step, hash_of
 from factorlib.runner.project import RESERVED, SHARED, Project, check_name
-from factorlib.runner.store import (
-    DECODE_ERRORS,
-    LOCK,
-    Entry,
-    Hash,
-    Store,
-    is_locked,
-    lock,
-    remove_killed_runs,
-    stamps_of,
-)
+from factorlib.runner.run_folder import no_runs
+from factorlib.runner.store import DECODE_ERRORS, Entry, Hash, Store, stamps_of
 from factorlib.wholefile import replace_file, write_text
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 NO_STAGE = "left over"  # damaged results, and files without a key
 
@@ -164,31 +149,6 @@ def view_of(store: Store, outputs: Mapping[str, str], gather: str | None) -> Pat
     with contextlib.suppress(OSError):  # Another run was faster.
         os.rename(draft, view)
     return view
-
-
-def begin_run(store: Store) -> tuple[Path, BaseFileLock]:
-    """Create a run's folder for unfinished results, and return it with the lock in it that shows that the run lives."""
-    folder = store.tmp / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    with _entrance(store):
-        return folder, lock(folder / LOCK)
-
-
-@contextlib.contextmanager
-def no_runs(store: Store) -> Iterator[None]:
-    """Keep runs from starting inside, where results are deleted; InputError if a run is going on."""
-    with _entrance(store):
-        if any(is_locked(folder / LOCK) for folder in store.tmp.iterdir()):
-            raise InputError("a run is going on", file=store.root, cure="wait until it has ended")
-        yield
-
-
-@contextlib.contextmanager
-def _entrance(store: Store) -> Iterator[None]:
-    """Admit one command at a time; the folders of killed runs are deleted first."""
-    store.tmp.mkdir(parents=True, exist_ok=True)
-    with lock(store.root / "door.lock", wait=True):
-        remove_killed_runs(store.tmp)
-        yield
 
 
 # ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -19,7 +19,8 @@ from factorlib.errors import InputError
 from factorlib.runner.dataset_state import DatasetState
 from factorlib.runner.display import Display
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.results_folder import begin_run, view_of
+from factorlib.runner.results_folder import view_of
+from factorlib.runner.run_folder import begin_run
 from factorlib.runner.store import lock
 from factorlib.runner.worker import Outcome, StageCode, Task, Workers, run_step
 from factorlib.wholefile import append_text, write_text

@@ -44,8 +44,6 @@ Stamp = list[int]  # size in bytes, time of the content in ns
 FORMAT = 10  # of the cache; one of another format is ignored
 FRESH_NS = 2_000_000_000  # A file changed this recently may change again within its clock's grain: it is not cached.
 NO_FILE: Stamp = [-1, 0]  # a link, a pipe: nothing that a stage may write
-LOCK = "lock"  # in the folder of a run, which holds it
-ABANDONED = 86400.0  # seconds without a change after which a draft outside a run is of a killed process
 DECODE_ERRORS = (OSError, msgspec.MsgspecError, UnicodeError, RecursionError)
 
 
@@ -252,14 +250,6 @@ def is_locked(path: Path) -> bool:
     except OSError as error:
         return isinstance(error, TimeoutError)
     return False
-
-
-def remove_killed_runs(folder: Path) -> None:
-    """Delete the folders of runs whose lock is free, and drafts without a change for a day."""
-    for path in (path for path in folder.iterdir() if path.is_dir() and not is_locked(path / LOCK)):
-        with contextlib.suppress(FileNotFoundError):
-            if path.name.startswith("run-") or time.time() - path.stat().st_mtime > ABANDONED:
-                shutil.rmtree(path, ignore_errors=True)
 
 
 def stamps_of(folder: str | Path, prefix: str = "") -> dict[str, Stamp]:

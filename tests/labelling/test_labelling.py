@@ -13,11 +13,11 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 from PIL import Image
-from tests.labels.test_label_image import scene
 
 from factorlib.labelling.server import MaskSet, Server
 from factorlib.labels.mask_files import read_values
 from tests.browser import CHROMIUM, started
+from tests.labels.test_label_image import scene
 from tests.refusal import refusal
 
 ROOT = Path(__file__).resolve().parents[2]
