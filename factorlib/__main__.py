@@ -35,14 +35,14 @@ def project() -> Project:
 
     Without a checkout, it is the current folder with the pipeline that pip installed with the package.
     """
-    here = Path.cwd()
-    checkout = next((folder for folder in (LIBRARY, here, *here.parents) if (folder / PIPELINE).is_file()), None)
+    cwd = Path.cwd()
+    checkout = next((folder for folder in (LIBRARY, cwd, *cwd.parents) if (folder / PIPELINE).is_file()), None)
     if not (root := os.environ.get("FACTORLIB_ROOT") or checkout):
         for shipped in (folder / SHIPPED for folder in (LIBRARY, *LIBRARY.parents)):
             if (shipped / PIPELINE).is_file():
-                return Project(here, photo_sets(), shipped=shipped)
+                return Project(cwd, photo_sets(), shipped=shipped)
         cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<folder with {PIPELINE}, stages and data>"
-        raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=here, cure=cure)
+        raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=cwd, cure=cure)
     return Project(Path(root).resolve(), photo_sets())
 
 

@@ -130,8 +130,8 @@ def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[n
     """Return distinct colours by label, near the photos' mean colours; row 0 is the background's."""
     pixels = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image, _ in pictures)])
     labels = np.concatenate([np.zeros(0), *(labels.label.ravel() for _, labels in pictures)])
-    own = [pixels[labels == k] for k in range(1, len(names) + 1)]
-    mean = [each.mean(axis=0) / 255 if len(each) else np.full(3, 0.5) for each in own]
+    material_pixels = [pixels[labels == k] for k in range(1, len(names) + 1)]
+    mean = [each.mean(axis=0) / 255 if len(each) else np.full(3, 0.5) for each in material_pixels]
     tags = nearest_tags(names, srgb_decode(np.array(mean)))
     return np.array([PAPER, *(ImageColor.getrgb(tags[name]) for name in names)], np.uint8)
 

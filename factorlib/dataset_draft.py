@@ -155,7 +155,9 @@ def _visible_meshes(
     for photo in photos:
         masks = labelled.by_photo.get(photo)
         materials = masks if isinstance(masks, dict) else ()
-        visible[photo] = _shown_in(photo, entries) or sorted({mesh_of[word] for word in materials if times[word] == 1})
+        visible[photo] = _meshes_named_in(photo, entries) or sorted(
+            {mesh_of[word] for word in materials if times[word] == 1}
+        )
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in photos if not visible[photo]]
     return visible
@@ -176,7 +178,7 @@ def _photo_entries(
         objects = [{"name": mesh, "mesh": mesh} for mesh in visible[photo] or [UNKNOWN] * bool(entries)]
         if objects and (silhouettes := labelled.silhouettes.get(photo)):
             only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
-            mesh_of = {name: (_shown_in(name, entries) or [only])[0] for name in silhouettes}
+            mesh_of = {name: (_meshes_named_in(name, entries) or [only])[0] for name in silhouettes}
             objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes.items()]
         mask = labelled.by_photo.get(photo, UNKNOWN)
         photos.append({"name": photo, "image": path, "masks": mask, "objects": objects})
@@ -296,11 +298,11 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
     """
     materials = spec["materials"]
     for name, entry in spec["meshes"].items():
-        of = entry.get("parts", {})
+        part_materials = entry.get("parts", {})
         objects: list[tuple[str, dict]] = []
         silhouettes = []
         known = []
-        if UNKNOWN not in of.values():
+        if UNKNOWN not in part_materials.values():
             continue
         for photo in spec["photos"]:
             for obj in photo["objects"]:
@@ -309,22 +311,22 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
                     with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
                         silhouettes.append(_silhouette(photo, obj, materials, file))
                         objects.append((photo["name"], obj))
-        mesh = read_mesh(file(entry["file"]), list(of), {part: part for part in of})
-        told = match_parts(mesh, len(of), silhouettes)
-        for k, part in [(k, part) for k, part in enumerate(of) if of[part] == UNKNOWN]:
+        mesh = read_mesh(file(entry["file"]), list(part_materials), {part: part for part in part_materials})
+        told = match_parts(mesh, len(part_materials), silhouettes)
+        for k, part in [(k, part) for k, part in enumerate(part_materials) if part_materials[part] == UNKNOWN]:
             ranked = [paired.labels[k] if paired else [] for paired in told]
             margins = [paired.margins[k] if paired else 0.0 for paired in told]
             sure = [margin >= MARGIN and each[0] != HIDDEN for margin, each in zip(margins, ranked)]
             likely = [" or ".join(materials[label - 1] for label in each if label != HIDDEN) for each in ranked]
             if not any(sure):
                 first = max(likely, key=len, default="")
-                of[part] = f"{UNKNOWN}{BESIDE}{first}" if first else UNKNOWN
+                part_materials[part] = f"{UNKNOWN}{BESIDE}{first}" if first else UNKNOWN
                 missing.append(f"mesh {name}: write which material {part} is made of" + f" ({first})" * bool(first))
                 continue
             usual = Counter(each[0] for each, yes in zip(ranked, sure) if yes).most_common(1)[0][0]
             least = min(margin for margin, yes in zip(margins, sure) if yes)
             known.append(part)
-            of[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
+            part_materials[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
             for (photo, obj), each, yes, words in zip(objects, ranked, sure, likely):
                 if yes and each[0] != usual:
                     obj.setdefault("materials", {})[part] = materials[each[0] - 1]
@@ -348,10 +350,10 @@ def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[st
     return Silhouette(label[::every, ::every])
 
 
-def _shown_in(photo: str, meshes: Collection[str]) -> list[str]:
+def _meshes_named_in(photo: str, meshes: Collection[str]) -> list[str]:
     """Return the meshes that a photo shows: the only one, or those whose names are whole words of the photo's.
 
-    >>> _shown_in("my_red-chair_2", ["stool", "chair", "red-chair", "hair"])
+    >>> _meshes_named_in("my_red-chair_2", ["stool", "chair", "red-chair", "hair"])
     ['chair', 'red-chair']
     """
     ends = [end for word in re.finditer("[A-Za-z0-9]+", photo) for end in word.span()]

@@ -34,9 +34,9 @@ class InputError(ValueError):
         super().__init__(fault)
 
     def __str__(self) -> str:
-        where = "".join(f"{part}: " for part in (self.file, self.key) if part is not None)
+        location = "".join(f"{part}: " for part in (self.file, self.key) if part is not None)
         cure = f"\n  {self.cure}" if self.cure else ""
-        return f"{where}{self.fault}{cure}"
+        return f"{location}{self.fault}{cure}"
 
     def __reduce__(self) -> tuple:  # for pickling in a worker process
         return partial(InputError, self.fault, file=self.file, key=self.key, cure=self.cure), ()

@@ -39,7 +39,15 @@ from factorlib.reading import check_plain
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
 from factorlib.recipe.read_recipe import check_recipe, files_of
-from factorlib.render.photo_scene import DistantLight, Orbit, PhotoScene, TracedPicture, as_it_is, resized, traced_photo
+from factorlib.render.photo_scene import (
+    DistantLight,
+    Orbit,
+    PhotoScene,
+    TracedPicture,
+    identity_tone,
+    resized,
+    traced_photo,
+)
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
 from factorlib.report.pictures import data_uri
@@ -113,13 +121,13 @@ class UnknownName(InputError, KeyError):
 class Named(Mapping[str, T]):
     """A mapping whose error for a missing name lists the known ones."""
 
-    def __init__(self, what: str, table: Mapping[str, T]):
-        self._what = what
+    def __init__(self, kind: str, table: Mapping[str, T]):
+        self._kind = kind
         self._table = table
 
     def __getitem__(self, name: str) -> T:
         if not isinstance(name, str) or name not in self._table:
-            raise UnknownName(f"there is no {self._what} {name!r}", cure=did_you_mean(str(name), self._table))
+            raise UnknownName(f"there is no {self._kind} {name!r}", cure=did_you_mean(str(name), self._table))
         return self._table[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -129,7 +137,7 @@ class Named(Mapping[str, T]):
         return len(self._table)
 
     def __repr__(self) -> str:
-        return f"{self._what}s: {', '.join(self._table)}"
+        return f"{self._kind}s: {', '.join(self._table)}"
 
 
 class Result:
@@ -215,7 +223,7 @@ class Result:
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
         of_photo = light if isinstance(light, str) and light in self.photos else None
         about = f"{photo}/{obj} in {light if isinstance(light, str) else 'a given light'}"
-        return Picture(traced, as_it_is if of_photo is None else self._solved.tone(of_photo), about)
+        return Picture(traced, identity_tone if of_photo is None else self._solved.tone(of_photo), about)
 
     def insert(self, photo: str, **fields: Any) -> Drawn:
         """Insert a further object on the ground of a photo, with its shadow.

@@ -77,8 +77,8 @@ def make_venv() -> None:
     if find_spec("ensurepip") is None:  # Debian has it in a separate package.
         sys.exit(f"set-up: this Python has no venv; install it: sudo apt-get install python{version}-venv")
     READY.unlink(missing_ok=True)
-    same = (VENV / "lib" / f"python{version}").is_dir()
-    venv.create(VENV, clear=not same, with_pip=True, symlinks=True)
+    is_same_version = (VENV / "lib" / f"python{version}").is_dir()
+    venv.create(VENV, clear=not is_same_version, with_pip=True, symlinks=True)
 
 
 def install_packages() -> None:

@@ -50,7 +50,7 @@ class Validation:
             settings: the file that gives them, for errors
         """
         checks = dict(self._checks(slice_, photo, params, settings))
-        new = [check for what, check in checks.items() if what not in self._done]
+        new = [check for check_name, check in checks.items() if check_name not in self._done]
         self._done |= checks.keys()
         return _faults(new)
 
@@ -74,9 +74,9 @@ class Validation:
             return []
         lights = sorted(light for light, names in together.items() if names)
         members = [[light for light in lights if component[min(together[light])] == k] for k in range(groups)]
-        said = "; ".join(map(", ".join, members))
+        group_list = "; ".join(map(", ".join, members))
         return [
-            f"the lights fall into {groups} groups that share no material ({said}): "
+            f"the lights fall into {groups} groups that share no material ({group_list}): "
             "brightness and colour cannot be compared between them. "
             "A photo that shows a material of each would link them"
         ]
@@ -95,12 +95,12 @@ class Validation:
                     continue
                 yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, file, limits)
         elif slice_ == "known":
-            for name, of in self.spec.known.illumination.items():
+            for name, light in self.spec.known.illumination.items():
                 key = f"known.illumination.{name}"
-                if isinstance(of, str):
-                    yield f"light {of}", partial(read_light_map, self.file(of), key)
+                if isinstance(light, str):
+                    yield f"light {light}", partial(read_light_map, self.file(light), key)
                 else:
-                    ball = next(mirror_balls(self.spec, name, of))[1]
+                    ball = next(mirror_balls(self.spec, name, light))[1]
                     yield f"ball {name}", partial(self._ball, ball, f"{key}.chrome")
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():
@@ -136,9 +136,9 @@ class Validation:
         check_values(path, most_megapixels, f"{key}.image")
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
         objects = read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
-        own = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
+        object_materials = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
         masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
-        check_materials(labels, objects, own, self.spec.materials, self.file(masks), f"{key}.objects")
+        check_materials(labels, objects, object_materials, self.spec.materials, self.file(masks), f"{key}.objects")
 
     def _object(self, obj: MeshInstance, relative: str, limits: Limits) -> None:
         """Check the parts of a mesh file, which is read once; a failure is raised again for every object."""

@@ -72,8 +72,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     # given data: refuse objects behind the camera, warn of materials that do not match and of an unlikely camera
     for obj, source in zip(objects, sources, strict=True):
         if obj.pose is not None:
-            given_by = "dataset" if source is None or source == "given" else source
-            check_before_camera(obj.caster.mesh, obj.pose, name, obj.name, given_by)
+            pose_source = "dataset" if source is None or source == "given" else source
+            check_before_camera(obj.caster.mesh, obj.pose, name, obj.name, pose_source)
     object_labels = [obj.caster.mesh.labels for obj in objects]
     warn_of_materials(channels["label"], object_labels, inputs.facts["dataset.materials"], name)
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)

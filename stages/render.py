@@ -16,7 +16,7 @@ from factorlib.dataset.schema import LightSlice
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
-from factorlib.images.tone import shown
+from factorlib.images.tone import apply_tone
 from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.render.resynthesis import Reflector, Surroundings, balls, observed_cells, resynthesised
@@ -66,7 +66,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     around = surroundings(inputs, model, exported.gauge)
     radiance = resynthesised(reflector, materials, photo, geometry, report, around)
     if tone := model.tone.get(name):
-        radiance = shown(radiance, tone.exponent, tone.pivot)
+        radiance = apply_tone(radiance, tone.exponent, tone.pivot)
     _write(out / "resynthesis" / name, radiance, exposure, ball=False)
     # balls and reflectance maps, material by material
     observed = observed_pixels(photo, geometry)
@@ -93,7 +93,7 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     table = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
     table = with_surface_normals(table, inputs.folders.get("surface"))
     if not model.self_shadowing:
-        table = msgspec.structs.replace(table, visibility=None, met=None)
+        table = msgspec.structs.replace(table, visibility=None, occluder=None)
     bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None
     return Surroundings(table, None if bounced is None else bounced / (gauge.export_factor or 1.0))
 

@@ -206,5 +206,5 @@ class MaskedPhoto:
 
     def _labels(self, obj: MeshInstance, entry: MeshEntry) -> list[int]:
         """Return the label of each part of the shape in this photo."""
-        made_of: Mapping[str, str | None] = entry.parts or {ALL_OF_IT: entry.material}
-        return [self.materials.index({**made_of, **obj.materials}[part]) + 1 for part in parts_of(entry)]
+        part_materials: Mapping[str, str | None] = entry.parts or {ALL_OF_IT: entry.material}
+        return [self.materials.index({**part_materials, **obj.materials}[part]) + 1 for part in parts_of(entry)]

@@ -36,7 +36,7 @@ from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface_table import BEGINNING, FILE, SurfaceTable, Tried
+from factorlib.results.surface_table import BEGINNING, FILE, DetailEvidence, SurfaceTable
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (
@@ -95,8 +95,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         for values_by_mesh in (displacements, factors)
     ]
     table = SurfaceTable(
-        bool(displacements), Tried.of(result.evidence, result.stiffness.turn),
-        bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,
+        bool(displacements), DetailEvidence.from_decision(result.evidence, result.stiffness.turn),
+        bool(factors), DetailEvidence.from_decision(result.painted, result.stiffness.factor), result.gains, *by_mesh,
     )  # fmt: skip
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
@@ -203,5 +203,5 @@ def _estimate_surface(
         of_blocks,
         start_from_photos(len(inputs.facts["dataset.materials"])),
         params.seed,
-        lambda share, what: progress(share, 1, what),
+        lambda share, activity: progress(share, 1, activity),
     )

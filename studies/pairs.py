@@ -173,7 +173,7 @@ def render_pair(
         lit = {"light": scenes[light].scene.light, "materials": scenes[material].scene.materials}
         camera = insertion.scene.camera.window(left, top, 1.0, right - left, bottom - top)
         insertion = replace(insertion, scene=replace(insertion.scene, camera=camera, **lit))
-        background = sets[light].straightened(photo)[window]
+        background = sets[light].linear_photo(photo)[window]
         result = inserted(insertion, background, recovered.covered(photo)[window], recipe.samples, seed=seed)
         return sets[light].tone(photo)(result.composite), result
 

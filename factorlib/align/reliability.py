@@ -202,7 +202,7 @@ def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
     if not agree.any():
         return np.zeros(agree.shape)
     # distance to contours, jumps and disagreement; slant
-    extent = max(np.ptp(where) for where in np.nonzero(agree)) + 1
+    extent = max(np.ptp(indices) for indices in np.nonzero(agree)) + 1
     distance = distance_transform_edt(np.pad(agree, 1, mode="edge"))[1:-1, 1:-1]
     result = np.clip(distance / max(FULL_DISTANCE * extent, 1.0), 0, 1) * np.clip(maps.edge / FULL_COSINE, 0, 1)
     unsure = (maps.facet / FACET) ** 2 + (normal_spread(maps) / TURN) ** 2  # (1) less 1

@@ -119,14 +119,14 @@ def picture_errors(
     estimate = estimate[box]
     truth = truth[box]
     union = union[box]
-    shown = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
-    ssim = ssim_map(shown[0], shown[1], union)
+    displayed = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
+    ssim = ssim_map(displayed[0], displayed[1], union)
 
     def error(region: Mask) -> PictureError:
         """Return the errors inside one region."""
         psnr_linear = psnr(estimate[region], truth[region], white)
         dssim = round(float(np.clip((1 - ssim[region].mean()) / 2, 0, 1)), 9)
-        return PictureError(psnr_linear, psnr(shown[0][region], shown[1][region], 1.0), dssim)
+        return PictureError(psnr_linear, psnr(displayed[0][region], displayed[1][region], 1.0), dssim)
 
     return {name: error(region[box]) for name, region in regions.items()}
 

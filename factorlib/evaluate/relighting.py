@@ -108,7 +108,7 @@ def compare_relighting(
     truths: Mapping[str, Reflectance],
     estimated_lights: Mapping[str, OctahedralLight],
     true_lights: Mapping[str, OctahedralLight],
-    seen: Mapping[str, Sequence[str]],
+    observed: Mapping[str, Sequence[str]],
 ) -> Relighting | None:
     """Compare every material with a truth in every light with a truth; None if there is no such pair.
 
@@ -117,7 +117,7 @@ def compare_relighting(
         truths: true materials by name
         estimated_lights: recovered lights by name
         true_lights: true lights by name
-        seen: the materials observed in each light
+        observed: the materials observed in each light
     """
     pairs = [(li, m) for li in true_lights if li in estimated_lights for m in truths if m in estimates]
     if not pairs:
@@ -138,7 +138,7 @@ def compare_relighting(
 
     balls: dict[str, dict[str, RelitBall]] = {}
     for (li, m), white, errors in zip(pairs, whites, errors_by_gauge(kinds, true, whites, error, below_white=True)):
-        balls.setdefault(li, {})[m] = RelitBall(m in seen.get(li, ()), 1 / white, errors)
+        balls.setdefault(li, {})[m] = RelitBall(m in observed.get(li, ()), 1 / white, errors)
     every = [b for row in balls.values() for b in row.values()]
     hidden = [b for b in every if not b.observed]
     return Relighting(balls, _mean(every), _mean(hidden) if hidden else None)
@@ -177,8 +177,8 @@ def compare_relit_set(
     nulls = []
     for m, light in ((m, light) for light in true_lights if light in estimated_lights for m in names):
         ball = appearances(true_lights[light]).ball(truths[m])
-        scores[m, light] = shown_psnr(appearances(estimated_lights[light]).ball(estimates[m]), ball)
-        nulls.append(shown_psnr(np.broadcast_to(ball.mean(axis=0), ball.shape), ball))
+        scores[m, light] = displayed_psnr(appearances(estimated_lights[light]).ball(estimates[m]), ball)
+        nulls.append(displayed_psnr(np.broadcast_to(ball.mean(axis=0), ball.shape), ball))
     if not scores:
         return None
     worst = min(scores, key=scores.__getitem__)
@@ -200,7 +200,7 @@ def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
     return vec3(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)
 
 
-def shown_psnr(recovered: Samples, true: Samples) -> float:
+def displayed_psnr(recovered: Samples, true: Samples) -> float:
     """Return the PSNR in dB of two balls at the exposure of the true one, or at exposure 1 if that is black."""
     mean = float(np.mean(true, dtype=float))
     exposure = MEAN_SHOWN / mean if mean > np.finfo(np.float32).tiny else 1.0

@@ -55,8 +55,8 @@ def _change(solved: Solved, lit: Appearances) -> float:
     """Return the mean square change of a ball in a light, summed over diffuse, specular and roughness."""
     ball = lit.ball(solved.reflectance)
     exposure = MEAN_SHOWN / max(float(ball.mean()), 1e-30)
-    shown = tone_mapped(ball, exposure)
-    squares = [np.mean((tone_mapped(lit.ball(other), exposure) - shown) ** 2) for other in _others(solved)]
+    display = tone_mapped(ball, exposure)
+    squares = [np.mean((tone_mapped(lit.ball(other), exposure) - display) ** 2) for other in _others(solved)]
     return float(np.sum(squares)) / 2
 
 

@@ -48,11 +48,11 @@ class Visibility(msgspec.Struct, frozen=True):
     """Visibility of k directions from n points.
 
     visibility  255 where a direction is free of the objects, 0 where not
-    met         codes of the surfaces that are hit
+    occluder    codes of the surfaces that are hit
     """
 
     visibility: UInt8[np.ndarray, "n k"]
-    met: UInt16[np.ndarray, "n k"]
+    occluder: UInt16[np.ndarray, "n k"]
 
 
 class Occluders(Caster):
@@ -126,7 +126,7 @@ class Occluders(Caster):
         spacing = max(float(np.median(cKDTree(cast.place).query(cast.place, k=2)[0][:, 1])), 1e-12)
         places = np.column_stack([points.place / spacing, NORMAL_WEIGHT * shading_normal])
         nearest = cKDTree(places[subset]).query(places)[1]
-        return Visibility(visibility.visibility[nearest], visibility.met[nearest])
+        return Visibility(visibility.visibility[nearest], visibility.occluder[nearest])
 
     def visibility_from(
         self,
@@ -147,13 +147,13 @@ class Occluders(Caster):
             Visibility and codes of the hiding surfaces.
         """
         visibility = np.full((len(shading_normal), len(directions)), 255, np.uint8)
-        met = np.full(visibility.shape, NO_OCCLUDER, np.uint16)
+        occluder = np.full(visibility.shape, NO_OCCLUDER, np.uint16)
         material = self.mesh.face_label.astype(np.int64) - 1
         codes = np.array([[*occluder_codes(material, normal), NO_OCCLUDER] for normal in (self.normal, -self.normal)])
         for row, k, face, behind in self.hidden_from(points, shading_normal, directions, report):
             visibility[row, k] = 0
-            met[row, k] = codes[behind.astype(int), face]
-        return Visibility(visibility, met)
+            occluder[row, k] = codes[behind.astype(int), face]
+        return Visibility(visibility, occluder)
 
     def hidden_from(
         self,

@@ -98,19 +98,19 @@ def read_photo(path: str | Path, encoding: str | None = None, key: str | None = 
     return decoded(open_photo(path, key), encoding, 1, path)
 
 
-def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path, key: str | None = None) -> None:
+def check_bright(photo: Photo, mask: Bool[np.ndarray, "h w"], path: str | Path, key: str | None = None) -> None:
     """Check that some finite pixel of a region has positive radiance.
 
     Args:
         photo: The photo.
-        where: Mask of the region.
+        mask: Mask of the region.
         path: File to name in the error.
         key: Key to name in the error.
 
     Raises:
         InputError: If all pixels are black or negative.
     """
-    if not (photo.radiance[where & photo.finite] > 0).any():
+    if not (photo.radiance[mask & photo.finite] > 0).any():
         raise InputError(
             "every pixel in its mask is black, or less than 0",
             file=path,

@@ -34,7 +34,7 @@ PALETTE = (
 
 def exposure_of(
     radiance: Float[np.ndarray, "*batch 3"],
-    where: Bool[np.ndarray, "*batch"] | None = None,
+    mask: Bool[np.ndarray, "*batch"] | None = None,
     percentile: float = PERCENTILE,
 ) -> float:
     """Return the factor that takes the `percentile` of each pixel's brightest channel to white.
@@ -43,7 +43,7 @@ def exposure_of(
 
     Args:
         radiance: Linear radiance.
-        where: Mask of the pixels that count.
+        mask: Mask of the pixels that count.
         percentile: Percentile.
 
     Returns:
@@ -53,7 +53,7 @@ def exposure_of(
     4.0
     """
     brightest = np.asarray(radiance).max(axis=-1)
-    brightest = brightest[np.isfinite(brightest) & (True if where is None else where)]
+    brightest = brightest[np.isfinite(brightest) & (True if mask is None else mask)]
     white = float(np.percentile(brightest, percentile)) if brightest.size else 0.0
     return 1 / white if white > 0 else 1.0
 

@@ -71,7 +71,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         }
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
-        absolute = self.solution.interreflection.kept
+        absolute = self.solution.interreflection.accepted
         gauge = table.Gauge(RULE + DETERMINED * absolute + self._known_rule(), component, self._gauge_of_errors())
         return table.MaterialTable(solved, gauge, self.model())
 
@@ -107,7 +107,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         """Return the sentence that states the gauge of the standard errors."""
         return (
             GAUGE
-            + ABSOLUTE * self.solution.interreflection.kept
+            + ABSOLUTE * self.solution.interreflection.accepted
             + uncertainty.GIVEN * bool(self.problem.known.materials or self.problem.known.lights)
         )
 
@@ -154,9 +154,9 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
             lobes={block.name: len(light) for block, light in illuminations},
             lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase == "subset"],
-            self_shadowing=solution.shadows.kept,
+            self_shadowing=solution.shadows.accepted,
             self_shadowing_chosen_by=_comparison(solution.shadows),
-            interreflection=solution.interreflection.kept,
+            interreflection=solution.interreflection.accepted,
             interreflection_chosen_by=_comparison(solution.interreflection),
             light_prior=self.solver == "joint",
             splitting_chosen_by=solution.splitting,
@@ -180,4 +180,4 @@ def _rows(materials: Materials) -> list[tuple[table.Channels, table.Channels, fl
 
 def _comparison(decision: Decision) -> dict[str, float]:
     """Return the held-out losses of the models that were compared, and the margin."""
-    return {k: value for k, value in msgspec.structs.asdict(decision).items() if k != "kept" and value is not None}
+    return {k: value for k, value in msgspec.structs.asdict(decision).items() if k != "accepted" and value is not None}

@@ -40,7 +40,7 @@ def bounced_light(observations: Observations, radiance: Float[np.ndarray, "n 3"]
 
     Normals, views and directions are in the camera frame of each photo.
     """
-    if observations.visibility is None or observations.met is None:
+    if observations.visibility is None or observations.occluder is None:
         return None
     incoming = np.zeros((len(observations), 6))
     hidden = observations.visibility.min(1) < 255
@@ -54,7 +54,7 @@ def bounced_light(observations: Observations, radiance: Float[np.ndarray, "n 3"]
 
 
 def radiance_by_code(observations: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
-    """Return B of every code of `Observations.met` in one photo; the last row is the radiance of an unknown surface."""
+    """Return B of every code of `Observations.occluder` in one photo; the last row is the radiance of an unknown surface."""
     normal = unit_vectors(observations.normal)
     bins = fibonacci_sphere(BINS)
     photo_mean = np.average(radiance, axis=0, weights=observations.weight)
@@ -98,7 +98,7 @@ def _received_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 
 
     The highlight is at least as wide as the spacing of the directions, as in `factorlib.light.visibility`.
     """
-    hit_code = observations.met
+    hit_code = observations.occluder
     # `bounced_light` selects only such observations
     assert observations.visibility is not None and hit_code is not None
     count = observations.visibility.shape[1]

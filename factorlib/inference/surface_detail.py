@@ -127,7 +127,7 @@ def decide_detail(scores: PhotoScores, reference: PhotoScores, held_out: float, 
         likelihood: Threshold of the marginal likelihood, in standard errors.
     """
     evidence = compare_models(reference.losses, scores.losses, held_out)
-    return msgspec.structs.replace(evidence, kept=evidence.kept and scores.gain_over(reference) > likelihood)
+    return msgspec.structs.replace(evidence, accepted=evidence.accepted and scores.gain_over(reference) > likelihood)
 
 
 class DetailTrial(msgspec.Struct, frozen=True):
@@ -368,7 +368,9 @@ class DetailSearch(msgspec.Struct, frozen=True):
             return set(names)
         restricted = [(name, [self.trial.restrict_turns(detail, {name}) for detail in turned]) for name in names]
         scores = {name: self.trial.score_photos(details, self.tick, self.plain) for name, details in restricted}
-        return {name for name, mesh_scores in scores.items() if decide_detail(mesh_scores, self.plain, 0.0, 0.0).kept}
+        return {
+            name for name, mesh_scores in scores.items() if decide_detail(mesh_scores, self.plain, 0.0, 0.0).accepted
+        }
 
 
 def estimate_surface(
@@ -377,7 +379,7 @@ def estimate_surface(
     attached: list[Attached],
     start: Start,
     seed: int = 0,
-    report: ProgressReport = lambda share, what: None,
+    report: ProgressReport = lambda share, activity: None,
 ) -> SurfaceEstimate:
     """Return the detail of the meshes, if photos gain from detail that was estimated without them.
 
@@ -401,19 +403,21 @@ def estimate_surface(
     search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), scores, tick)
     turned, movable = search.select_turns()
     chosen = (
-        turned if turned.evidence.kept else StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
+        turned
+        if turned.evidence.accepted
+        else StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
     )
     candidates = [Stiffness(chosen.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
     nodes = trial.shared_nodes & surfaces.node_mask(movable)
     painted = search.select_stiffness(candidates, chosen.scores, (0.0, CLEARLY_FOR), nodes)
-    chosen = painted if painted.evidence.kept else chosen
-    if not (turned.evidence.kept or painted.evidence.kept):
+    chosen = painted if painted.evidence.accepted else chosen
+    if not (turned.evidence.accepted or painted.evidence.accepted):
         return SurfaceEstimate(initial, turned.evidence, painted.evidence)
     gains = dict(zip(trial.names, (scores.values - chosen.scores.values).tolist(), strict=True))
     detail = search.fit_all_photos(chosen.stiffness, movable, pieces, seed)
-    displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.kept else {}
+    displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.accepted else {}
     displacements = {name: displacement for name, displacement in displacements.items() if name in movable}
-    factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.kept else {}
+    factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.accepted else {}
     return SurfaceEstimate(initial, turned.evidence, painted.evidence, chosen.stiffness, gains, displacements, factors)
 
 
@@ -452,15 +456,15 @@ class ProgressSections(msgspec.Struct, frozen=True):
 
     report: ProgressReport
 
-    def section(self, begin: float, end: float, number: int, what: str) -> Tick:
+    def section(self, begin: float, end: float, number: int, activity: str) -> Tick:
         """Return a function that reports one more completed unit of work at each call.
 
         Args:
             begin: Share that is complete before.
             end: Share that is complete afterwards.
             number: Number of units.
-            what: Activity.
+            activity: Activity.
         """
-        self.report(begin, what)
+        self.report(begin, activity)
         done = count(1)
-        return lambda *_: self.report(begin + (end - begin) * min(next(done) / number, 1.0), what)
+        return lambda *_: self.report(begin + (end - begin) * min(next(done) / number, 1.0), activity)

@@ -57,19 +57,19 @@ def read_labels(
     Raises:
         InputError: If the masks are invalid or empty.
     """
-    where = file(masks if isinstance(masks, str) else next(iter(masks.values())))
+    mask_file = file(masks if isinstance(masks, str) else next(iter(masks.values())))
     if not isinstance(masks, str):
         places = {name: (file(masks[name]), f"{key}.{name}") for name in sorted(masks, key=materials.index)}
         labels = _merged({name: read_inside(*place, size) for name, place in places.items()}, materials, places, edge=0)
     elif masks.lower().endswith(".json"):
-        inside = read_coco(where, image, materials, size, key)
-        labels = _merged(inside, materials, dict.fromkeys(inside, (where, key)), edge=DRAWN_EDGE)
+        inside = read_coco(mask_file, image, materials, size, key)
+        labels = _merged(inside, materials, dict.fromkeys(inside, (mask_file, key)), edge=DRAWN_EDGE)
     else:
-        labels = _labels_of_png(read_values(where, key, size), where, materials, key)
+        labels = _labels_of_png(read_values(mask_file, key, size), mask_file, materials, key)
     if labels is None or not labels.label.any():
         raise InputError(
             "the mask is empty: no pixel has a material",
-            file=where,
+            file=mask_file,
             key=key,
             cure="paint at least one material, or drop the photo",
         )
@@ -97,13 +97,13 @@ def read_objects(
     for index, (name, path) in enumerate(masks):
         if path is None:
             continue
-        where = f"{key}[{index}].mask"
-        inside = read_inside(file(path), where, size)
+        mask_key = f"{key}[{index}].mask"
+        inside = read_inside(file(path), mask_key, size)
         if not inside.any():
             raise InputError(
                 f"the mask of object {name!r} is empty",
                 file=file(path),
-                key=where,
+                key=mask_key,
                 cure="paint it, or leave the key out",
             )
         if objects[inside].any():
@@ -112,7 +112,7 @@ def read_objects(
             raise InputError(
                 f"objects {masks[other][0]!r} and {name!r} share {count} pixels",
                 file=file(path),
-                key=where,
+                key=mask_key,
                 cure="a pixel shows one object: erase it from the one behind",
             )
         objects[inside] = index + 1
@@ -184,7 +184,7 @@ def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: lis
 
 
 def _merged(
-    inside: Mapping[str, np.ndarray], materials: list[str], where: Mapping[str, tuple[Path, str]], edge: int
+    inside: Mapping[str, np.ndarray], materials: list[str], sources: Mapping[str, tuple[Path, str]], edge: int
 ) -> Labels | None:
     """Merge several masks into one map; None if there are none.
 
@@ -195,10 +195,10 @@ def _merged(
     label = np.zeros(next(iter(inside.values())).shape, dtype=np.uint8)
     left_out = label > 0
     for number, material in ((k, name) for k, name in enumerate(materials, 1) if name in inside):
-        path, key = where[material]
+        path, key = sources[material]
         for other in np.unique(label[inside[material] & (label > 0)]).tolist():
             shared = inside[material] & (label == other)
-            other_path = where[materials[other - 1]][0]
+            other_path = sources[materials[other - 1]][0]
             fault = f"materials {materials[other - 1]!r} and {material!r} share {int(shared.sum())} pixels"
             fault += f" with {other_path.name}" if other_path != path else ""
             square = (edge + 1, edge + 1)

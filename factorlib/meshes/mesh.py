@@ -152,14 +152,14 @@ def consistently_wound(
     columns = np.r_[b + other, b + count - other]
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
     _, part = connected_components(graph, directed=False)
-    as_it_is = part[:count]
+    unflipped = part[:count]
     flipped = part[count:]
     # area, or signed volume, that each component keeps less that which it flips
     area = area_vectors(vertices, faces)
     volume = np.einsum("fd,fd->f", vertices[faces].mean(axis=1) - vertices[faces[:, 0]].mean(axis=0), area)
     gain = np.linalg.norm(area, axis=1) if has_border else volume
-    total = np.bincount(as_it_is, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
-    return (total[as_it_is] < 0) & (as_it_is != flipped), has_border
+    total = np.bincount(unflipped, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
+    return (total[unflipped] < 0) & (unflipped != flipped), has_border
 
 
 def corner_normals(
@@ -194,16 +194,16 @@ def corner_normals(
     # for each corner, the weighted sum over the corners at its vertex within the crease angle
     for group in _chunks(counts.astype(np.int64) ** 2):
         mine, theirs = _pairs(starts[group], counts[group])
-        own = normal[order[mine] // 3]
+        face_normal = normal[order[mine] // 3]
         other_normals = normal[order[theirs] // 3]
-        share = weight[order[theirs]] * (np.einsum("pd,pd->p", own, other_normals) >= threshold - 1e-12)
+        share = weight[order[theirs]] * (np.einsum("pd,pd->p", face_normal, other_normals) >= threshold - 1e-12)
         low = starts[group][0]
         high = starts[group][-1] + counts[group][-1]
         summed = [np.bincount(mine - low, share * other_normals[:, d], high - low) for d in range(3)]
         result[order[low:high]] = np.stack(summed, axis=1)
     length = np.linalg.norm(result, axis=1, keepdims=True)
-    own = np.repeat(normal, 3, axis=0)
-    return np.where(length > 1e-12, result / np.maximum(length, 1e-300), own).reshape(-1, 3, 3)
+    face_normal = np.repeat(normal, 3, axis=0)
+    return np.where(length > 1e-12, result / np.maximum(length, 1e-300), face_normal).reshape(-1, 3, 3)
 
 
 def _pairs(starts: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

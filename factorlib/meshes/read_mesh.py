@@ -244,9 +244,9 @@ def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray,
     solid = distinct & (np.linalg.norm(area_vectors(vertices, faces), axis=1) > 1e-14 * extent**2)
     single = np.zeros(len(faces), bool)  # no duplicate of an earlier face, in either winding
     single[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]] = True
-    for count, what in ((int((~solid).sum()), "zero-area"), (int((solid & ~single).sum()), "duplicate")):
+    for count, defect in ((int((~solid).sum()), "zero-area"), (int((solid & ~single).sum()), "duplicate")):
         if count:
-            log.info("%s: %d %s faces dropped", file, count, what)
+            log.info("%s: %d %s faces dropped", file, count, defect)
     if not (solid & single).any():
         raise InputError(
             "every face has zero area",

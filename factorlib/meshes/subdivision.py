@@ -134,16 +134,18 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         mean = csr_array(diags_array(1 / np.maximum(np.asarray(weight.sum(1)).reshape(-1), 1e-300)) @ weight)
         return -np.stack([mean @ (slope @ displacement) for slope in self.gradients()], axis=1)
 
-    def displacement(self, turn: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    def displacement(
+        self, turn: Float[np.ndarray, "v 3"], node_weight: Float[np.ndarray, " v"]
+    ) -> Float[np.ndarray, " v"]:
         """Fit the displacement along the normals whose normals n' = n − ∇d are nearest to the given ones.
 
         This is least squares over triangles, weighted by area (Poisson's equation). `turn` is n' − n at nodes, in the
-        mesh's frame; `seen` is the weight of each node's turn, from 0 to 1. The result is in units of the extent.
+        mesh's frame; `node_weight` is the weight of each node's turn, from 0 to 1. The result is in units of the extent.
         """
         slopes = self.gradients()
         areas = self.areas
         wanted = turn[self.faces].mean(1)
-        weight = areas * np.maximum(seen[self.faces].min(1), UNSEEN)
+        weight = areas * np.maximum(node_weight[self.faces].min(1), UNSEEN)
         # normal equations Σ_a G_aᵀ W G_a d = −Σ_a G_aᵀ W t_a, with a small multiple of the identity
         system = sum(slope.T @ diags_array(weight) @ slope for slope in slopes)
         system = system + LEVEL * areas.mean() * eye_array(self.nodes)

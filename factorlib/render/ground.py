@@ -147,7 +147,7 @@ def on_floor(
     floor = disk(foot - HAIR * extent * plane.normal, plane.normal, REACH * extent, grey)
     # L₀, L₁ and W
     without = traced_photo(scene, samples, world_from_camera, with_light)
-    with_ = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
+    with_floor = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
     alone = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
     # f, from the distance between the foot of the objects and the floor point of each pixel
     eye = world_from_camera[:3, 3]
@@ -156,4 +156,4 @@ def on_floor(
     distance = np.linalg.norm(points - foot, axis=-1).reshape(alone.shape) / (REACH * extent)
     fade = smooth_step((1 - np.nan_to_num(distance, nan=np.inf)) / (1 - SOLID))
     weight = np.maximum(alone, fade)[..., None]
-    return weight * with_ + (1 - weight) * without
+    return weight * with_floor + (1 - weight) * without

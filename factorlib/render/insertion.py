@@ -226,12 +226,12 @@ def inserted(
     beside = (1 - coverage)[..., None]
     disc = insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))
     rendering = partial(insertion.radiance, samples=samples, seed=seed)
-    without, with_, shadow = _lighting(
+    without, with_object, shadow = _lighting(
         [rendering(e, guides=insertion.scene.denoise) for e in (disc, disc | new)], coverage, fade
     )
     report(3)
     # (2)
-    composite = beside * shadow * photo + np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
+    composite = beside * shadow * photo + np.maximum(with_object - beside * shadow * without, 0) * (beside < 1)
     # change of the ground's specular part: the object's reflection in it
     if insertion.ground.polish is not None:
         polished = insertion.disc(insertion.ground.polish)
@@ -256,21 +256,21 @@ def _lighting(
         coverage: α
         fade: weight of the shadow
     """
-    (without, guides_without), (with_, guides_with) = (np.split(each, [3], axis=-1) for each in renderings)
+    (without, guides_without), (with_object, guides_with) = (np.split(each, [3], axis=-1) for each in renderings)
     with np.errstate(divide="ignore", invalid="ignore"):
-        shadow = np.where(without > 0, with_ / without, 1.0)
+        shadow = np.where(without > 0, with_object / without, 1.0)
     beside = coverage == 0
     if beside.any():
         row, column = distance_transform_edt(~beside, return_distances=False, return_indices=True)
         shadow = shadow[row, column]
     shadow = 1 + (shadow - 1) * fade
     if guides_with.size:  # not the photo, nor pixels whose paths miss the object
-        clean, with_ = (
+        clean, with_object = (
             denoised(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
-            for noisy, guides in ((shadow, guides_without), (with_, guides_with))
+            for noisy, guides in ((shadow, guides_without), (with_object, guides_with))
         )
         shadow = np.where(shadow == 1, 1, clean)
-    return without, with_, shadow
+    return without, with_object, shadow
 
 
 def compared_shadow(

@@ -261,7 +261,7 @@ Radiance = Float[np.ndarray, "h w 3"]
 Tone = Callable[[Radiance], Radiance]
 
 
-def as_it_is(radiance: Radiance) -> Radiance:
+def identity_tone(radiance: Radiance) -> Radiance:
     """Return the radiance unchanged: the tone curve of a photo that has none."""
     return radiance
 
@@ -275,7 +275,7 @@ class TracedPicture(msgspec.Struct, frozen=True):
     """
 
     pixels: Float[np.ndarray, "h w 4"]
-    tone: Tone = as_it_is
+    tone: Tone = identity_tone
 
     @property
     def coverage(self) -> Float[np.ndarray, "h w 1"]:

@@ -74,7 +74,7 @@ def spot_beside(
     return Spot(plane, max(spots, key=room), height)
 
 
-def spot_at(
+def unproject_spot(
     scene: PhotoScene, plane: Plane, neighbour: PlacedMesh, pixel: tuple[float, float], relative_height: float
 ) -> Spot:
     """Return the place on the ground that a pixel shows.

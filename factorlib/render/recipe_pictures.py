@@ -26,7 +26,7 @@ from factorlib.recipe.kinds import AnyRecipe, is_light_file
 from factorlib.render.ground import on_floor
 from factorlib.render.insertion import NEW, STEPS, InsertionScene, compared_shadow, inserted
 from factorlib.render.photo_scene import Orbit, PhotoScene, TracedPicture, lit_ball, resized, traced_photo, turned_light
-from factorlib.render.placement import free_placement, spot_at, spot_beside, standing_mesh
+from factorlib.render.placement import free_placement, spot_beside, standing_mesh, unproject_spot
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
@@ -153,7 +153,7 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
         )
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
-        requested = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
+        requested = unproject_spot(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
     else:
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
         slenderness = wide / np.ptp(mesh.vertices @ up)  # diameter about the upright axis over the extent along it
@@ -185,13 +185,13 @@ def write_insertion(
     insertion = insertion_scene(recipe, results, photo)
     if insertion.moved:
         log.warning("%s: %s", photo, insertion.moved)
-    linear = results.straightened(photo)
+    linear = results.linear_photo(photo)
     covered = results.covered(photo)
     result = inserted(insertion, linear, covered, recipe.samples, lambda done: report(done / STEPS))
     match = compared_shadow(insertion, result, linear, covered, recipe.samples)
     # Pixels that the new object does not change keep the photo's values exactly.
-    same = (result.coverage[..., None] == 0) & (result.shadow == 1) & (insertion.ground.polish is None)
-    _write_opaque(out / photo, np.where(same, results.photo(photo), results.tone(photo)(result.composite)))
+    unchanged = (result.coverage[..., None] == 0) & (result.shadow == 1) & (insertion.ground.polish is None)
+    _write_opaque(out / photo, np.where(unchanged, results.photo(photo), results.tone(photo)(result.composite)))
     pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
     source = "that of dataset.yaml"
     if results.grounds[photo].ground is None:

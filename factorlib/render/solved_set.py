@@ -13,7 +13,7 @@ from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.tone import shown, straightened
+from factorlib.images.tone import apply_tone, invert_tone
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
@@ -21,7 +21,7 @@ from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import GroundSurface
-from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, as_it_is, with_sun
+from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, identity_tone, with_sun
 from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -113,10 +113,10 @@ class SolvedSet:
         channels = self._masks(photo)
         return np.nan_to_num(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float))
 
-    def straightened(self, photo: str) -> Float[np.ndarray, "h w 3"]:
+    def linear_photo(self, photo: str) -> Float[np.ndarray, "h w 3"]:
         """Return the photo's linear radiance with its tone curve undone."""
         tone = self.table.model.tone.get(photo)
-        return straightened(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
+        return invert_tone(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
 
     def pixel(self, photo: str, pixel: tuple[float, float]) -> tuple[float, float]:
         """Convert a pixel of the photo to pixels of the picture from `masks`; InputError if it lies outside."""
@@ -138,7 +138,7 @@ class SolvedSet:
     def tone(self, photo: str) -> Tone:
         """Return the photo's tone curve."""
         tone = self.table.model.tone.get(photo)
-        return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else as_it_is
+        return (lambda radiance: apply_tone(radiance, tone.exponent, tone.pivot)) if tone else identity_tone
 
     def light(self, name: str) -> DistantLight:
         """Return a photo's light in its camera's axes, or the light of a file."""

@@ -231,17 +231,19 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     points = SurfacePoints(sides.vertices + LIFT * mesh.radius * outward, outward, np.ones(len(outward), bool))
     pairs = []
     for vertex, k, face, turned in occluders.hidden_from(points, sides.normals, directions):
-        met = mesh.faces[face, 0].astype(np.int64)
+        hit_vertex = mesh.faces[face, 0].astype(np.int64)
         # a hit on the back of a triangle is on the mesh's other side, or inside a closed mesh, which is black
-        behind = np.sum(occluders.hit_normals(face, turned) * mesh.normals[met], 1) < 0
-        met = np.where((face < 0) | behind & (not mesh.open), len(outward), met + np.where(behind, single, 0))
-        pairs.append(np.stack([vertex, k, met])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
-    vertex, k, met = np.concatenate(pairs, axis=1)
+        behind = np.sum(occluders.hit_normals(face, turned) * mesh.normals[hit_vertex], 1) < 0
+        hit_vertex = np.where(
+            (face < 0) | behind & (not mesh.open), len(outward), hit_vertex + np.where(behind, single, 0)
+        )
+        pairs.append(np.stack([vertex, k, hit_vertex])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
+    vertex, k, hit_vertex = np.concatenate(pairs, axis=1)
     return {
         "directions": _base64(directions, "<f4"),
         "counts": _base64(np.bincount(vertex, minlength=len(outward)), "<u2"),
         "hidden": _base64(k, "u1"),
-        "met": _base64(met, "<u2" if len(outward) < 1 << 16 else "<u4"),
+        "met": _base64(hit_vertex, "<u2" if len(outward) < 1 << 16 else "<u4"),
     }
 
 

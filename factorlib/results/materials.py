@@ -128,7 +128,7 @@ class Decision(msgspec.Struct, frozen=True):
         log_bayes_factor: log marginal likelihood with it, less that without it
     """
 
-    kept: bool
+    accepted: bool = msgspec.field(name="kept")
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
     margin: float | None = None

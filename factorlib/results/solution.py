@@ -42,8 +42,8 @@ class Earlier(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, exposures=exposures)
 
 
-def _decided(kept: bool, chosen_by: dict[str, float]) -> str | None:
-    return ("on" if kept else "off") if chosen_by.keys() & {"margin", "log_bayes_factor"} else None
+def _decided(accepted: bool, chosen_by: dict[str, float]) -> str | None:
+    return ("on" if accepted else "off") if chosen_by.keys() & {"margin", "log_bayes_factor"} else None
 
 
 def read_earlier(folder: Path) -> Earlier:

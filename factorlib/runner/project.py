@@ -149,8 +149,8 @@ class Project(msgspec.Struct, frozen=True):
 
     def short_path(self, path: Path) -> str:
         """Format a path for messages: relative to the current folder if it lies below."""
-        here = Path.cwd()
-        return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
+        cwd = Path.cwd()
+        return str(path.relative_to(cwd)) if path.is_relative_to(cwd) else str(path)
 
     def dataset_folder(self, name: str) -> Path:
         """Return the folder of a dataset by its name in data/ or its path; InputError if there is none."""

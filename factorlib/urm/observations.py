@@ -65,7 +65,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: the direction is visible; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = None  # codes of `geometry.occluder_codes`; needs `visibility`
+    occluder: UInt16[np.ndarray, "n k"] | None = None  # codes of `geometry.occluder_codes`; needs `visibility`
     exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
@@ -107,10 +107,10 @@ NAMES = {
     "photos": "photo",
     "illuminations": "illumination",
 }
-# optional columns of K values a row: type, value if everything is visible, meaning
-WIDE: dict[str, tuple[np.dtype, int, str]] = {
-    "visibility": (np.dtype("u1"), 255, VISIBILITY),
-    "met": (np.dtype("<u2"), NO_OCCLUDER, MET),
+# optional columns of K values a row, by attribute: column, type, value if everything is visible, meaning
+WIDE: dict[str, tuple[str, np.dtype, int, str]] = {
+    "visibility": ("visibility", np.dtype("u1"), 255, VISIBILITY),
+    "occluder": ("met", np.dtype("<u2"), NO_OCCLUDER, MET),
 }
 
 
@@ -125,8 +125,8 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     about = {**UNITS, **{kind: getattr(observations, kind) for kind in NAMES}}
     if any(exposure is not None for exposure in observations.exposures):
         about["exposures"] = observations.exposures
-    for name, (wide, _, meaning) in WIDE.items():
-        if (values := getattr(observations, name)) is not None:
+    for attribute, (name, wide, _, meaning) in WIDE.items():
+        if (values := getattr(observations, attribute)) is not None:
             data = pa.py_buffer(np.ascontiguousarray(values, dtype=wide))
             type_ = pa.binary(values.shape[1] * wide.itemsize)  # the values of a row as one binary of fixed size
             columns[name] = pa.FixedSizeBinaryArray.from_buffers(type_, len(values), [None, data])
@@ -142,11 +142,12 @@ def read_observations(path: str | Path) -> Observations:
     Raises:
         InputError: If it is any other Parquet file.
     """
-    parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
+    parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *(name for name, *_ in WIDE.values())), CURE)
     with reading(WHAT, path, cure=CURE):
         narrow = {name: dtype for name, dtype in (COLUMNS | OPTIONAL).items() if name in parts}
         fields: dict[str, Any] = {name: _array(parts[name], dtype, name in VECTORS) for name, dtype in narrow.items()}
-        fields |= {name: _rows_of_bytes(parts[name], wide) for name, (wide, *_) in WIDE.items() if name in parts}
+        wide = {attribute: (parts[name], dtype) for attribute, (name, dtype, *_) in WIDE.items() if name in parts}
+        fields |= {attribute: _rows_of_bytes(*column) for attribute, column in wide.items()}
         fields |= {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in NAMES}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
         observations = Observations(**fields, exposures=exposures)
@@ -171,10 +172,10 @@ def _check(observations: Observations) -> None:
         raise ValueError("column 'confidence' is not between 0 and 1")
     if observations.place is not None and not np.isfinite(observations.place).all():
         raise ValueError("column 'place' is not finite")
-    if observations.met is not None:
-        if observations.visibility is None or observations.visibility.shape != observations.met.shape:
+    if observations.occluder is not None:
+        if observations.visibility is None or observations.visibility.shape != observations.occluder.shape:
             raise ValueError("column 'met' has not the directions of a column 'visibility'")
-        known = observations.met[observations.met != NO_OCCLUDER]
+        known = observations.occluder[observations.occluder != NO_OCCLUDER]
         if len(known) and known.max() >= BINS * len(observations.materials):
             raise ValueError("column 'met' points beyond the names of the metadata")
 
@@ -201,7 +202,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         renumbered = [new[index] if len(new) else index for new, index in zip(numbers, indices, strict=True)]
         fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
-    fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()}
+    fills = {name: (dtype, nothing) for name, (_, dtype, nothing, _) in WIDE.items()}
     fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0), "detail": (np.dtype("f4"), 1)}
     # optional columns: parts without them get full visibility, full confidence, and the origin as place
     for name, (dtype, fill) in fills.items():

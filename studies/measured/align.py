@@ -113,7 +113,7 @@ def measure(key: Key) -> dict:
     photo = posed_photo(*key)
     caster = Caster(photo.mesh)
     start_s = (time.process_time(), time.perf_counter())
-    silhouette = silhouette_of_object({"label": photo.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
+    silhouette = silhouette_of_object({"label": photo.label.astype(float)}, 1, caster.mesh.labels, has_mask=False)
     obj = ObjectToAlign("object", caster, silhouette)
     result = align_photo([obj], Camera(WIDTH, HEIGHT, 1.0, photo.camera.centre), KnownFocal(), " ".join(map(str, key)))
     maps = rasterise(caster, result.camera, result.poses[0])

@@ -129,8 +129,8 @@ def test_codes_say_which_material_hides_a_direction_and_how_it_faces():
     up = np.tile([0.0, 0.0, -1.0], (2, 1))
     past = occluders.visibility_from(SurfacePoints(place, up, np.ones(2, bool)), up, directions)
     hidden = past.visibility == 0
-    assert hidden[0].any() and (past.met[~hidden] == NO_OCCLUDER).all()
-    material, faces = np.divmod(past.met[hidden].astype(int), BINS)
+    assert hidden[0].any() and (past.occluder[~hidden] == NO_OCCLUDER).all()
+    material, faces = np.divmod(past.occluder[hidden].astype(int), BINS)
     assert (material == 2).all()
     row, k = np.nonzero(hidden)
     toward_floor = np.sum(fibonacci_sphere(BINS)[faces] * directions[k], 1)

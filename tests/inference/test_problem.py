@@ -168,7 +168,7 @@ def bowl(albedo, depth=0.5, size=40, count=1024) -> Observations:
     radiance = np.full((len(n), 3), albedo * (1 - depth) / (1 - albedo * depth))
     how = {
         "visibility": np.where(hidden, 0, 255).astype(np.uint8),
-        "met": np.where(hidden, codes, NO_OCCLUDER).astype(np.uint16),
+        "occluder": np.where(hidden, codes, NO_OCCLUDER).astype(np.uint16),
     }
     return observations_from_front(n, radiance, np.zeros(len(n), int), ("white",), **how)
 
@@ -186,7 +186,7 @@ def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
 def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own_unit_alike():
     seen, factor = bowl(0.5, size=20, count=256), 1e4
     open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
-    for none in (open_, msgspec.structs.replace(seen, met=None)):
+    for none in (open_, msgspec.structs.replace(seen, occluder=None)):
         assert blocks_of_observations(none, Noise())[0].bounced is None
     brighter = msgspec.structs.replace(seen, radiance=factor * seen.radiance)
     sent, more = (bounced_light(photo, photo.radiance) for photo in (seen, brighter))

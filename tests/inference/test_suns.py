@@ -50,7 +50,7 @@ def tried(irradiance: float, seed: int):
 def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     cells, sun, wide = tried(0.5, seed)
     light, irradiance = sun.light, solved(0.5, seed)[1]
-    assert accept_sun(cells, sun).kept and compare_illuminations(wide, sun, CLEARLY_AGAINST).kept
+    assert accept_sun(cells, sun).accepted and compare_illuminations(wide, sun, CLEARLY_AGAINST).accepted
     assert light.suns.sum() == 1 and np.arccos(light.axis[light.suns][0] @ TOWARDS) < cells.light.spacing[0] / 4
     np.testing.assert_allclose(light.energy[light.suns][0], irradiance, rtol=0.3)
 
@@ -58,18 +58,18 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_no_sun_is_found_in_a_sky_without_one(seed):
     cells, sun, wide = tried(0.0, seed)
-    assert not (accept_sun(cells, sun).kept and compare_illuminations(wide, sun, CLEARLY_AGAINST).kept)
+    assert not (accept_sun(cells, sun).accepted and compare_illuminations(wide, sun, CLEARLY_AGAINST).accepted)
 
 
 def test_the_solve_keeps_suns_of_lights_that_have_one():
     problem, *_, fit = solved(0.5, 1)
     found = select_suns(problem, fit, FitRunner())
-    assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
+    assert found.evidence[0].accepted and found.fit.point.lights[0].suns.any()
     again = select_suns(problem, found.fit, FitRunner())
-    assert again.fit is found.fit and again.evidence[0].kept
+    assert again.fit is found.fit and again.evidence[0].accepted
     cloudy, *_, fit = solved(0.0, 1)
     none = select_suns(cloudy, fit, FitRunner())
-    assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
+    assert not none.evidence[0].accepted and none.fit.point.lights[0] is fit.point.lights[0]
 
 
 @pytest.mark.parametrize(
@@ -82,4 +82,4 @@ def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share,
     total = one.light.energy.sum() / lobe_integral(np.array([SUN]))[0]
     weight = total * share * np.array(colour) / sum(colour)
     lit = msgspec.structs.replace(one, light=one.light.with_lobes(SUN_LOBE, weight))
-    assert accept_sun(one, lit).kept == kept
+    assert accept_sun(one, lit).accepted == kept

@@ -177,7 +177,7 @@ def errors(normals: np.ndarray, true: np.ndarray) -> float:
 
 def test_dents_that_the_object_has_not_are_found_in_three_lights():
     what, body, given, true = on_spheres(3, 0.15, 1)
-    assert what.evidence.kept and sum(what.gains.values()) > 0 and not what.painted.kept
+    assert what.evidence.accepted and sum(what.gains.values()) > 0 and not what.painted.accepted
     turn = body.turns_from_displacements(what.displacements)
     for block, exact in zip(given.blocks, true.blocks, strict=True):
         at = attached_to(exact.normal, body)
@@ -200,7 +200,7 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
         own = attached_to(block.normal, surfaces())
         at.append(msgspec.structs.replace(own, node=own.node + one.nodes * exact[:, None]))
     what = estimate_surface(problem.with_blocks(given), body, at, start_from_photos(3))
-    assert what.evidence.kept and set(what.displacements) == {"dented"}
+    assert what.evidence.accepted and set(what.displacements) == {"dented"}
     turn = body.turns_from_displacements(what.displacements)
     assert turn[body.node_mask({"dented"})].any() and not turn[body.node_mask({"exact"})].any()
     for block, shown, own in zip(problem.blocks, given, at, strict=True):
@@ -228,7 +228,7 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
         for b, x, y in zip(problem.blocks, plain, shown, strict=True)
     ]
     what = estimate_surface(problem.with_blocks(blocks), body, at, start_from_photos(3))
-    assert what.painted.kept
+    assert what.painted.accepted
     seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
     assert np.corrcoef(what.log_factors["ball"][seen], log_factor[seen])[0, 1] > 0.8
 
@@ -249,7 +249,7 @@ def test_an_exact_surface_stays_in_sharp_lights(lights, shown, seed):
     problem, body = spheres([sharp(10 * seed + k) for k in range(lights)], shown=shown, size=22, noise=0.1), surfaces()
     at = [attached_to(block.normal, body) for block in problem.blocks]
     what = estimate_surface(problem, body, at, start_from_photos(3))
-    assert not what.evidence.kept and not what.displacements
+    assert not what.evidence.accepted and not what.displacements
 
 
 # ── Nodes under pixels: they are where the pixel's ray meets the mesh, in the frame of the object's pose, whichever s

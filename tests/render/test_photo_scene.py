@@ -25,7 +25,7 @@ from factorlib.render.photo_scene import (
     turned_light,
     with_sun,
 )
-from factorlib.render.placement import STEP, Spot, free_placement, spot_at, spot_beside, standing_mesh
+from factorlib.render.placement import STEP, Spot, free_placement, spot_beside, standing_mesh, unproject_spot
 from factorlib.results.materials import Reflectance
 from factorlib.tracing import scene as tracing
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
@@ -153,10 +153,10 @@ def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(pa
 
 def test_a_pixel_names_the_spot_that_it_shows(pair):
     plane = Plane(np.array([0, 1.0, 0]), np.array([0, -0.7, -6]))
-    spot = spot_at(pair, plane, pair.objects[0], (30.5, 33.0), 0.5)
+    spot = unproject_spot(pair, plane, pair.objects[0], (30.5, 33.0), 0.5)
     ray = SMALL.rays_through(np.array([[30.5, 33.0]]))[0] * [1, -1, -1]
     assert np.allclose(np.cross(spot.point, ray), 0, atol=1e-9) and spot.point[1] == pytest.approx(-0.7)
-    refusal("above the horizon", spot_at, pair, plane, pair.objects[0], (30.5, 3.0), 0.5)
+    refusal("above the horizon", unproject_spot, pair, plane, pair.objects[0], (30.5, 3.0), 0.5)
 
 
 # ── A floor takes the shadow of what stands on it, fades out, and changes nothing else ──────────────────────────────
@@ -380,7 +380,7 @@ def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked
     new, there, said = free_placement(scene_of(other), stand, spot, asked=False)
     assert words in said
     x, y = (int(v) for v in error.cure.split("[")[1].split("]")[0].split(","))
-    named = spot_at(scene_of(other), LOW, new, (x, y), 1.0)  # the place that is named is where it is moved to
+    named = unproject_spot(scene_of(other), LOW, new, (x, y), 1.0)  # the place that is named is where it is moved to
     assert np.linalg.norm(named.point - there.point) < 0.25
 
 

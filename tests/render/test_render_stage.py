@@ -103,7 +103,7 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     )  # the lower half is hidden, by nothing known
     normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     columns = {"view": view, "x": x, "y": y, "visibility": np.tile(visibility, (n, 1))}
-    columns |= {"met": np.full((n, 64), NO_OCCLUDER, np.uint16)}
+    columns |= {"occluder": np.full((n, 64), NO_OCCLUDER, np.uint16)}
     radiance, names = np.full((n, 3), 0.3), tuple(made_export.NAMES)
     seen = observations_from_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
     (tmp_path / "urm").mkdir()

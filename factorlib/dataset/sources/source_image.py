@@ -115,19 +115,19 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         error = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
     if not error <= MOST_OFF_PX:  # NaN where a pixel has no ray
         extent = f"by {error:.1f} px" if error == error else "so much that some pixels have no ray"
-        how = "the camera's lens distorts"
+        cause = "the camera's lens distorts"
         cure = (
             "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
             "or undistort by `colmap image_undistorter` and use its images, its model, and masks of them"
         )
         if camera.is_undistorted():
-            how = "the camera's pixels are not square"
+            cause = "the camera's pixels are not square"
             cure = (
                 "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
                 "or resample photos and masks to square pixels"
             )
         limit = f"up to {MOST_OFF_PX} px would not matter"
-        refuse(key, f"{how}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
+        refuse(key, f"{cause}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
     return focal, centre
 
 
