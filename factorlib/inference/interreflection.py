@@ -54,7 +54,7 @@ def bounced_light(observations: Observations, radiance: Float[np.ndarray, "n 3"]
 
 
 def radiance_by_code(observations: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
-    """Return B of every code of `Observations.occluder` in one photo; the last row is the radiance of an unknown surface."""
+    """Return B of every code of `Observations.occluder` in one photo; the last row is that of an unknown surface."""
     normal = unit_vectors(observations.normal)
     bins = fibonacci_sphere(BINS)
     photo_mean = np.average(radiance, axis=0, weights=observations.weight)

@@ -140,7 +140,8 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         """Fit the displacement along the normals whose normals n' = n − ∇d are nearest to the given ones.
 
         This is least squares over triangles, weighted by area (Poisson's equation). `turn` is n' − n at nodes, in the
-        mesh's frame; `node_weight` is the weight of each node's turn, from 0 to 1. The result is in units of the extent.
+        mesh's frame; `node_weight` is the weight of each node's turn, from 0 to 1. The result is in units of the
+        extent.
         """
         slopes = self.gradients()
         areas = self.areas
