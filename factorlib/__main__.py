@@ -163,7 +163,7 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
 }  # fmt: skip
 
 
-def run(words: list[str], program: str) -> int:
+def dispatch(words: list[str], program: str) -> int:
     """Run the verb of the command line and return its exit code.
 
     A first word that is neither an option nor a verb is a stage.
@@ -207,7 +207,9 @@ def main() -> NoReturn:
     try:
         with printable_streams(), raise_on_signals():
             logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
-            sys.exit(run(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib"))
+            sys.exit(
+                dispatch(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib")
+            )
     except InputError as error:
         sys.exit(printable(f"error: {error}"))
     except BrokenPipeError:  # The reader, such as `head`, has closed the pipe.

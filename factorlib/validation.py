@@ -15,7 +15,7 @@ import numpy as np
 from factorlib.dataset.check import MESHES, instance_materials, mirror_balls
 from factorlib.dataset.schema import Dataset, MeshInstance, PhotoEntry
 from factorlib.errors import InputError
-from factorlib.evaluate.comparison_gauge import connected_components
+from factorlib.evaluate.comparison_gauge import material_components
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import open_photo
@@ -69,7 +69,7 @@ class Validation:
             together.setdefault(photo.light, set()).update(
                 *(instance_materials(obj, self.spec) for obj in photo.objects)
             )
-        component = connected_components({light: sorted(names) for light, names in together.items() if names})
+        component = material_components({light: sorted(names) for light, names in together.items() if names})
         if (groups := len(set(component.values()))) < 2:
             return []
         lights = sorted(light for light, names in together.items() if names)

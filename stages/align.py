@@ -24,11 +24,11 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.lens import radial_lens
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
-from factorlib.meshes.mesh import scaled
+from factorlib.meshes.mesh import scale_mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, read_mesh
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectPose, PhotoPoses, entry_of, read_poses
+from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectPose, PhotoPoses, pose_fields, read_poses
 from factorlib.results.shape_table import read_shapes
 from factorlib.stage import Inputs, Progress
 
@@ -149,8 +149,8 @@ def read_objects(
             pixels = np.array([keypoint.pixel for keypoint in entry.keypoints]) / factor
             points = np.array([keypoint.point for keypoint in entry.keypoints])
             lens = radial_lens(slice_.camera, factor, *channels["label"].shape[::-1])
-            keypoints = Keypoints(lens.undistorted(pixels) if lens else pixels, points)
-        caster = Caster(scaled(mesh, scale))
+            keypoints = Keypoints(lens.undistort(pixels) if lens else pixels, points)
+        caster = Caster(scale_mesh(mesh, scale))
         objects.append(ObjectToAlign(entry.name, caster, silhouette, pose, keypoints, before, scale))
     return objects
 
@@ -177,7 +177,7 @@ def object_entry(
     measures = measure_reliability(obj, result, k)
     reasons = find_doubts(iou, agreement, measures, estimate, params)
     return ObjectPose(
-        **entry_of(result.poses[k]),
+        **pose_fields(result.poses[k]),
         scale=obj.scale,
         silhouette_iou=iou,
         label_agreement=agreement,

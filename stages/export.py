@@ -28,7 +28,7 @@ from factorlib.export.exported_scene import (
     DIRECT,
     ExportedScene,
     ExposedMap,
-    suns_of,
+    extract_suns,
     write_scene_json,
     write_script,
 )
@@ -128,7 +128,7 @@ def _solution_in_gauge(
             log.warning(
                 "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
             )
-        lights[name] = solved.get(name, no_lobes()).scaled(1 / factor)
+        lights[name] = solved.get(name, no_lobes()).scale(1 / factor)
     return table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json")
 
 
@@ -137,7 +137,7 @@ def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mappi
     write_lobes(out / "lobes.parquet", lights)
     write_text(out / "materials.mtlx", materialx(materials))
     write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
-    suns = {name: [sun.plain() for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
+    suns = {name: [sun.to_dict() for sun in extract_suns(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
         raise InputError(
             f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'",
@@ -162,7 +162,7 @@ def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, 
     write_usd_scene(folder / f"{photo}{SUFFIX}", scene)
     light = scene.light
     exposure = light.exposure
-    suns = suns_of(lobes.scaled(exposure), YUP_FROM_CAMERA @ light.camera_from_light)
+    suns = extract_suns(lobes.scale(exposure), YUP_FROM_CAMERA @ light.camera_from_light)
     name = PurePosixPath(light.file).stem
     sky = f"../illumination/{name}{SKY}.exr" if suns else light.file
     scene = msgspec.structs.replace(scene, light=msgspec.structs.replace(light, file=sky), suns=suns)
@@ -171,7 +171,7 @@ def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, 
         light = msgspec.structs.replace(light, file=f"light/{name}.exr")
     else:  # Mitsuba scales all channels alike, so the photo gets its own map; no illumination has a dot in its name
         light = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), light.camera_from_light)
-        _write_mitsuba_map(folder / light.file, lobes.take(~lobes.suns).scaled(exposure), params)
+        _write_mitsuba_map(folder / light.file, lobes.take(~lobes.suns).scale(exposure), params)
     write_scene(folder / f"{photo}.xml", msgspec.structs.replace(scene, light=light))
 
 
@@ -195,7 +195,7 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     sky = light.take(~light.suns)
     if light.suns.any():
         write_rgb_exr(out / "illumination" / f"{name}{SKY}.exr", lat_long_of_lobes(sky, *lat_long.shape[:2]), LAT_LONG)
-        write_suns(out / "illumination" / f"{name}_suns.gltf", suns_of(light, YUP_FROM_CAMERA))
+        write_suns(out / "illumination" / f"{name}_suns.gltf", extract_suns(light, YUP_FROM_CAMERA))
     _write_mitsuba_map(out / "scenes" / "light" / f"{name}.exr", sky, params)
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)

@@ -15,8 +15,8 @@ from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.camera_files import is_raw
 from factorlib.images.exr import write_exr
-from factorlib.images.lens import Undistorted, radial_lens
-from factorlib.images.photo import Photo, box_majority, check_bright, decoded, least_factor, open_photo
+from factorlib.images.lens import Undistortion, radial_lens
+from factorlib.images.photo import Photo, box_majority, check_bright, decode_photo, least_factor, open_photo
 from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
@@ -72,11 +72,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
         least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame)
     )
     factor = min(factor, height, width)
-    labels = reduced(labels, factor, path, key)
+    labels = reduce_labels(labels, factor, path, key)
     objects = box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
-    photo = decoded(opened, facts.encoding, factor, path)
-    photo, labels, objects = undistorted(photo, labels, objects, facts, f"{entry}.camera.distortion")
+    photo = decode_photo(opened, facts.encoding, factor, path)
+    photo, labels, objects = undistort_photo(photo, labels, objects, facts, f"{entry}.camera.distortion")
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
     warn_of_processing(opened.exif, photo, labels, path)
     progress(2, 3, f"{name}: writing")
@@ -116,7 +116,7 @@ def photo_facts(
     )
 
 
-def undistorted(
+def undistort_photo(
     photo: Photo, labels: Labels, objects: np.ndarray, facts: PhotoSlice, key: str
 ) -> tuple[Photo, Labels, np.ndarray]:
     """Remove the distortion that dataset.yaml gives; InputError if it is not invertible within the picture."""
@@ -124,12 +124,12 @@ def undistorted(
     if lens is None:
         return photo, labels, objects
     lens.check(photo.width, photo.height, "dataset.yaml", key)
-    pinhole = Undistorted(lens, photo.height, photo.width)
-    labels = Labels(pinhole.nearest(labels.label), pinhole.nearest(labels.left_out) | ~pinhole.inside)
-    return pinhole.photo(photo), labels, pinhole.nearest(objects)
+    pinhole = Undistortion(lens, photo.height, photo.width)
+    labels = Labels(pinhole.resample_nearest(labels.label), pinhole.resample_nearest(labels.left_out) | ~pinhole.inside)
+    return pinhole.photo(photo), labels, pinhole.resample_nearest(objects)
 
 
-def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
+def reduce_labels(labels: Labels, factor: int, path: Path, key: str) -> Labels:
     """Reduce labels by majority of each box; "left out" counts as a label.
 
     Raises:

@@ -15,7 +15,7 @@ from factorlib.render.solved_set import SolvedSet
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
 from factorlib.report.pictures import exposures, first_pictures, material_tags, photo_row, strip, surface_rows
-from factorlib.report.viewer import viewed
+from factorlib.report.viewer import viewer_data
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
 
@@ -42,7 +42,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     progress(next(done), total, "viewer")
-    viewer = viewed(run, lights, objects, exposures(run))
+    viewer = viewer_data(run, lights, objects, exposures(run))
     progress(next(done), total, "surfaces")
     moved = surface_rows(run, objects)
     progress(next(done), total, "first pictures")

@@ -44,7 +44,7 @@ from factorlib.jsonfile import write_json
 from factorlib.reading import read_text
 from factorlib.recipe.kinds import InsertRecipe
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import GroundSurface, InsertionResult, inserted
+from factorlib.render.insertion import GroundSurface, InsertionResult, insert_object
 from factorlib.render.photo_scene import DistantLight, PlacedMesh
 from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
@@ -163,7 +163,7 @@ def render_pair(
     factor = gauge_factor(recovered.materials, truth.materials)
     scene = scenes[0].scene
     materials = {name: scale_reflectance(m, factor) for name, m in scene.materials.items()}
-    scenes[0] = replace(scenes[0], scene=replace(scene, materials=materials, light=scene.light.scaled(1 / factor)))
+    scenes[0] = replace(scenes[0], scene=replace(scene, materials=materials, light=scene.light.scale(1 / factor)))
     left, top, right, bottom = _window(scenes)
     window = slice(top, bottom), slice(left, right)
 
@@ -174,7 +174,7 @@ def render_pair(
         camera = insertion.scene.camera.window(left, top, 1.0, right - left, bottom - top)
         insertion = replace(insertion, scene=replace(insertion.scene, camera=camera, **lit))
         background = sets[light].linear_photo(photo)[window]
-        result = inserted(insertion, background, recovered.covered(photo)[window], recipe.samples, seed=seed)
+        result = insert_object(insertion, background, recovered.photo_mask(photo)[window], recipe.samples, seed=seed)
         return sets[light].tone(photo)(result.composite), result
 
     (image, result), (true_image, true_result) = trace(False, False, False), trace(True, True, True)

@@ -149,7 +149,7 @@ def measure_reliability(obj: ObjectToAlign, alignment: PhotoAlignment, number: i
     return Reliability(
         contour_error(caster, target, estimate.state),
         normal_stderr_deg(caster, target, estimate.state),
-        estimate_pose(caster, view.mirrored(), QUICK).score if may_be_mirrored else None,
+        estimate_pose(caster, view.mirror(), QUICK).score if may_be_mirrored else None,
     )
 
 
@@ -186,7 +186,7 @@ def normal_stderr_deg(caster: Caster, target: Target, state: PoseState) -> float
     precisions, directions = np.linalg.eigh(information[:free, :free])
     for precision, direction in zip(precisions, directions.T, strict=True):
         move = direction * min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
-        moved = state.moved(np.append(move, np.zeros(7 - free)))
+        moved = state.apply_step(np.append(move, np.zeros(7 - free)))
         angles.append(normal_difference(unmoved, render_maps(caster, target, moved)))
     return float(np.sqrt(np.sum(np.square(angles))))
 

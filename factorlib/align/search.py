@@ -17,7 +17,7 @@ from factorlib.align.refine import PoseState, RefinedState, refine
 from factorlib.align.silhouette import ObjectView, Target, make_target
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, Maps, rasterise
-from factorlib.results.poses import RunnerUpPose, entry_of
+from factorlib.results.poses import RunnerUpPose, pose_fields
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Report = Callable[[float], None]
@@ -117,7 +117,7 @@ def estimate_pose(
 def _describe_runner_up(caster: Caster, target: Target, best: RefinedState, runner_up: RefinedState) -> RunnerUpPose:
     """Return the pose of the runner-up, its score, and the angle between its normals and those of the best pose."""
     maps = (render_maps(caster, target, result.state) for result in (best, runner_up))
-    pose = entry_of(runner_up.state.pose(caster))
+    pose = pose_fields(runner_up.state.pose(caster))
     return RunnerUpPose(**pose, score=runner_up.score, normal_difference_deg=normal_difference(*maps))
 
 

@@ -125,7 +125,7 @@ class ObjectView(msgspec.Struct, frozen=True):
         """Number of unknowns of `PoseState.moved` that may move; the last one is the focal length."""
         return 7 if self.focal_sigma > 0 else 6
 
-    def mirrored(self) -> "ObjectView":
+    def mirror(self) -> "ObjectView":
         """Return the view with left and right exchanged."""
         camera = msgspec.structs.replace(
             self.camera, centre=(self.camera.width - self.camera.centre[0], self.camera.centre[1])

@@ -78,12 +78,12 @@ def _ratio(cross: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
     return np.where(square > 0, cross / np.where(square > 0, square, 1.0), 1.0)
 
 
-def connected_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
+def material_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
     """Return the connected component of each material, given the materials observed in each light.
 
     A light links the materials observed in it.  Components are numbered by their first material's name.
 
-    >>> connected_components({"day": ["red", "white"], "night": ["blue"]})
+    >>> material_components({"day": ["red", "white"], "night": ["blue"]})
     {'blue': 0, 'red': 1, 'white': 1}
     """
     names = sorted({name for together in pairs.values() for name in together})

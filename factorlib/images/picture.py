@@ -11,7 +11,7 @@ from PIL import Image
 from PIL.ImageColor import getrgb
 from scipy.optimize import linear_sum_assignment
 
-from factorlib.images.exr import encoded
+from factorlib.images.exr import encode_pixels
 from factorlib.images.tone import srgb_encode
 from factorlib.reading import reading
 from factorlib.wholefile import write_bytes
@@ -80,7 +80,7 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
     """Encode an 8-bit PNG of 1, 3 or 4 channels (alpha not premultiplied), without date or program name."""
     pixels = np.asarray(pixels, dtype=np.uint8)
     # compression level 4 takes half the time of the default, 6, for 5 % more bytes
-    return encoded("picture.png", pixels, {"oiio:UnassociatedAlpha": 1, "png:compressionLevel": 4})
+    return encode_pixels("picture.png", pixels, {"oiio:UnassociatedAlpha": 1, "png:compressionLevel": 4})
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:

@@ -26,7 +26,7 @@ from factorlib.inference.uncertainty import ABSOLUTE, GAUGE, MaterialErrors
 from factorlib.light.lobes import Lobes
 from factorlib.results import materials as table
 from factorlib.results.materials import Decision, Uncertainty
-from factorlib.results.solution import Earlier
+from factorlib.results.solution import EarlierSolution
 
 LOBES_CHOSEN_BY = {
     "joint": "cells of the light prior, of which the brightest split while the marginal likelihood rises",
@@ -53,7 +53,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
     errors: MaterialErrors
     relative: dict[str, float]
     solver: Literal["joint", "paper"]
-    earlier: Earlier | None = None
+    earlier: EarlierSolution | None = None
 
     @cached_property
     def radiance(self) -> list[Float[np.ndarray, "n 3"]]:
@@ -66,7 +66,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         stderr = self._errors()
         kinds = self._kinds()
         solved = {
-            name: table.solved(table.Reflectance(*row), stderr[name], kind, self._known_parts(m))
+            name: table.attach_errors(table.Reflectance(*row), stderr[name], kind, self._known_parts(m))
             for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
         }
         components = connected_components(self.problem.blocks, len(self.names))
@@ -127,7 +127,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def lights(self) -> dict[str, Lobes]:
         """Return the lobes by illumination, in scene radiance."""
-        return {block.name: light.lobes.scaled(block.unit) for block, light in self.illuminations()}
+        return {block.name: light.lobes.scale(block.unit) for block, light in self.illuminations()}
 
     def exposures(self) -> dict[str, table.Channels]:
         """Return each photo's factor on its light, per channel."""
@@ -144,11 +144,11 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         """Return the model choices and their evidence; the pivots of tone curves are in scene radiance."""
         solution = self.solution
         illuminations = self.illuminations()
-        started: table.Started | UnsetType = UNSET
+        started: table.WarmStart | UnsetType = UNSET
         lights = [block.name for block, _ in illuminations]
         if self.earlier is not None:
             known = set(self.names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
-            started = table.Started(*map(sorted, known))
+            started = table.WarmStart(*map(sorted, known))
         return table.Model(
             solver=self.solver,
             lobes={block.name: len(light) for block, light in illuminations},

@@ -49,7 +49,7 @@ def bounced_light(observations: Observations, radiance: Float[np.ndarray, "n 3"]
         surfaces = radiance_by_code(observations.take(rows), radiance[rows])
         shadowed = rows[hidden[rows]]
         for chunk in np.split(shadowed, range(CHUNK_ROWS, len(shadowed), CHUNK_ROWS)):
-            incoming[chunk] = _received_from(observations.take(chunk), surfaces)
+            incoming[chunk] = _bounced_from(observations.take(chunk), surfaces)
     return incoming
 
 
@@ -93,7 +93,7 @@ def _mean_by_bin(
     return (count * mean + PSEUDO_COUNT * expected) / (count + PSEUDO_COUNT)
 
 
-def _received_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
+def _bounced_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
     """Return (1) at observations of one photo.
 
     The highlight is at least as wide as the spacing of the directions, as in `factorlib.light.visibility`.

@@ -31,7 +31,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
 from factorlib.inference.lights import Light, fibonacci_cells
 from factorlib.inference.materials import ROUGHNESS, Materials
-from factorlib.light.lobes import lobe_integral, squared_distances
+from factorlib.light.lobes import lobe_energy, squared_distances
 from factorlib.urm.observations import Observations
 
 START_CELLS = 400  # even cells at the start
@@ -130,7 +130,7 @@ def fit_known_light(
         for _ in range(ITERATIONS if number == SPLITTING_ROUNDS else ITERATIONS_BETWEEN):
             weight *= response.T @ (energy_of / (response @ weight)) / np.maximum(covered, LEAST_SOLID_ANGLE)[:, None]
         light = msgspec.structs.replace(light, weight=weight.astype(float))
-    return msgspec.structs.replace(light, fixed=covered >= LEAST_COVERAGE * lobe_integral(light.sharpness))
+    return msgspec.structs.replace(light, fixed=covered >= LEAST_COVERAGE * lobe_energy(light.sharpness))
 
 
 def light_from_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:

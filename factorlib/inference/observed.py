@@ -59,14 +59,14 @@ def gather_observations(
         tick: Called after each file.
     """
 
-    def merged(path: Path) -> PhotoObservations:
+    def read_merged(path: Path) -> PhotoObservations:
         """Return the usable observations of one file, merged."""
         read = with_surface_normals(read_observations(path), surface)
         usable = usable_observations(read)
         tick()
         return PhotoObservations(merge(usable, degrees), len(read), len(read) - len(usable))
 
-    return list(spread(merged, files))
+    return list(spread(read_merged, files))
 
 
 def blocks_of_observations(

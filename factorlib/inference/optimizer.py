@@ -192,13 +192,13 @@ class Descent(msgspec.Struct, frozen=True):
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        free = self.free & ~pushed_outward(state.theta.reshape(-1), -gradient)
+        free = self.free & ~outward_mask(state.theta.reshape(-1), -gradient)
         # H with D and the damping μ
         arrow = Arrow(state.systems, state.prior.hessian + hessian, free, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
         ends = np.cumsum([size, *(len(system.light_gradient) for system in state.systems)])[:-1]
 
-        def moved(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
+        def apply_step(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
             """Return θ and the lights after a step of all unknowns."""
             of_materials, *of_lights = np.split(step, ends)
             change = of_materials.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
@@ -209,7 +209,7 @@ class Descent(msgspec.Struct, frozen=True):
 
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
             """Return (2) and half its gradient."""
-            theta, likelihoods = moved(step)
+            theta, likelihoods = apply_step(step)
             prior = self.prior.evaluate(theta)
             parts = list(self.spread(LightLikelihood.gradient, likelihoods))
             off = (theta - state.theta).reshape(-1)
@@ -225,11 +225,13 @@ class Descent(msgspec.Struct, frozen=True):
             step, lights = arrow.solve(of_materials, of_lights)
             return np.concatenate([step, *lights])
 
-        theta, likelihoods = moved(minimise_lbfgs(objective, ends[-1] + len(state.systems[-1].light_gradient), metric))
+        theta, likelihoods = apply_step(
+            minimise_lbfgs(objective, ends[-1] + len(state.systems[-1].light_gradient), metric)
+        )
         return likelihoods, theta
 
 
-def pushed_outward(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
+def outward_mask(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
     """Return a mask of the unknowns at a bound that a direction would push beyond it."""
     lower = (theta <= np.resize(LOWER_BOUNDS, theta.size)) & (direction < 0)
     upper = (theta >= np.resize(UPPER_BOUNDS, theta.size)) & (direction > 0)

@@ -83,7 +83,9 @@ class PaperOptions(msgspec.Struct, frozen=True):
     seed: Seed = 0
 
 
-def solve(problem: JointProblem, materials: int, options: PaperOptions, report: EventReport = ignore_event) -> Solution:
+def solve_paper(
+    problem: JointProblem, materials: int, options: PaperOptions, report: EventReport = ignore_event
+) -> Solution:
     """Solve the problem as the paper does, in the gauge of `factorlib.inference.gauge`.
 
     The unknowns are those of the joint solver: materials 0 … `materials`−1 and one light per block.

@@ -50,10 +50,10 @@ from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import InitialFit, Start, refine_cells
 from factorlib.inference.surface_turns import (
-    Attached,
     Detail,
     LightTerms,
     Stiffness,
+    SurfacePositions,
     Surfaces,
     linearise_light,
     solve_detail,
@@ -136,7 +136,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
     problem: JointProblem
     fit: Fit
     surfaces: Surfaces
-    attached: list[Attached]
+    attached: list[SurfacePositions]
     prior: LightPrior
 
     def with_detail(self, detail: Detail) -> JointProblem:
@@ -376,7 +376,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
 def estimate_surface(
     problem: JointProblem,
     surfaces: Surfaces,
-    attached: list[Attached],
+    attached: list[SurfacePositions],
     start: Start,
     seed: int = 0,
     report: ProgressReport = lambda share, activity: None,
@@ -422,7 +422,7 @@ def estimate_surface(
 
 
 def fit_trial(
-    problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[Attached]], tick: Tick
+    problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[SurfacePositions]], tick: Tick
 ) -> tuple[DetailTrial, InitialFit]:
     """Return the problem without detail with its fit, and the fit on few cells.
 

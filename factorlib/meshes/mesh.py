@@ -51,11 +51,11 @@ class Mesh(msgspec.Struct, frozen=True):
         return float(np.linalg.norm(self.vertices[np.unique(self.faces)] - self.centre, axis=1).max())
 
 
-def scaled(mesh: Mesh, factors: Sequence[float]) -> Mesh:
+def scale_mesh(mesh: Mesh, factors: Sequence[float]) -> Mesh:
     """Scale the mesh's axes by `factors` > 0, about its origin; normals stay perpendicular to the surface.
 
     >>> tilted = Mesh(np.eye(3), np.array([[0, 1, 2]]), np.ones((3, 3)) / 3**0.5, np.array([1]))
-    >>> (scaled(tilted, (1, 1, 0.5)).normals[0] * 6**0.5).round(9).tolist()
+    >>> (scale_mesh(tilted, (1, 1, 0.5)).normals[0] * 6**0.5).round(9).tolist()
     [1.0, 1.0, 2.0]
     """
     along_axes = np.asarray(factors, dtype=float)
@@ -117,7 +117,7 @@ def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndar
     return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))
 
 
-def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[np.ndarray, " v"]:
+def weld_vertices(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[np.ndarray, " v"]:
     """Return the number of each vertex's position, equal for vertices closer than about `tolerance` × the extent."""
     low = vertices.min(axis=0)
     extent = float((vertices.max(axis=0) - low).max()) or 1.0
@@ -125,7 +125,7 @@ def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[n
     return np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def consistently_wound(
+def find_flipped_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Bool[np.ndarray, " f"], bool]:
     """Find the faces to flip so that neighbours agree, and whether the surface is open.

@@ -15,7 +15,7 @@ import numpy as np
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
 from factorlib.meshes.gltf_mesh import read_gltf
-from factorlib.meshes.mesh import Mesh, area_vectors, consistently_wound, corner_normals, welded
+from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipped_faces, weld_vertices
 from factorlib.meshes.obj import read_obj
 from factorlib.meshes.ply_stl_off import read_off, read_ply, read_stl
 from factorlib.meshes.subdivision import subdivided_mesh
@@ -120,7 +120,7 @@ class MeshCache:
                         cure="run `surface` again",
                     )
                 detail = np.exp(factors)[dense.node] if name in self.log_factors else None
-                mesh = msgspec.structs.replace(dense.moved(moves), detail=detail)
+                mesh = msgspec.structs.replace(dense.displace(moves), detail=detail)
             self._meshes[key] = mesh
         return self._meshes[key]
 
@@ -208,7 +208,7 @@ def usable(soup: TriangleSoup, face_label: np.ndarray, crease_deg: float, file: 
     faces = faces[keep]
     face_label = face_label[keep]
     supplied = soup.normals[keep]
-    flip, is_open = consistently_wound(vertices, faces)
+    flip, is_open = find_flipped_faces(vertices, faces)
     faces = np.where(flip[:, None], faces[:, ::-1], faces)
     supplied = np.where(flip[:, None, None], -supplied[:, ::-1], supplied)
     if flip.any():
@@ -236,7 +236,7 @@ def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray,
         InputError: If no face is left.
     """
     used, faces = np.unique(soup.faces, return_inverse=True)  # an unused vertex far away must not set the scale
-    weld = welded(soup.vertices[used])
+    weld = weld_vertices(soup.vertices[used])
     vertices = soup.vertices[used][np.unique(weld, return_index=True)[1]]
     faces = weld[faces.reshape(-1, 3)]
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from factorlib.meshes.mesh import Mesh, area_vectors, welded
+from factorlib.meshes.mesh import Mesh, area_vectors, weld_vertices
 
 LONGEST = 0.04  # longest edge after subdivision, in units of the mesh's extent
 LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the gradient's
@@ -125,7 +125,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         values = np.stack(slopes, axis=1)  # [triangle, corner, axis]
         return [csr_array((values[..., a].reshape(-1), (rows, self.faces.reshape(-1))), shape) for a in range(3)]
 
-    def turn_of(self, displacement: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+    def normal_change(self, displacement: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
         """Return −∇d at nodes, the change of normals by a displacement d in units of the extent."""
         # operator that averages over the triangles about each node, weighted by area, [v, f]
         count = len(self.faces)
@@ -153,7 +153,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         right = -sum(slope.T @ (weight * wanted[:, a]) for a, slope in enumerate(slopes))
         return spsolve(system.tocsc(), right)
 
-    def moved(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
+    def displace(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
         """Move the vertices along their nodes' normals, by a displacement in extents, and update the normals."""
         weighted = area_vectors(self.mesh.vertices, self.mesh.faces)
         sums = [np.bincount(self.faces.reshape(-1), np.repeat(weighted[:, a], 3), self.nodes) for a in range(3)]
@@ -161,7 +161,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         outward = np.stack(sums, axis=1)
         outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
         place = self.mesh.vertices + (displacement[:, None] * self.extent * outward)[self.node]
-        normal = self.mesh.normals + self.turn_of(displacement)[self.node]
+        normal = self.mesh.normals + self.normal_change(displacement)[self.node]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         return msgspec.structs.replace(self.mesh, vertices=place, normals=normal)
 
@@ -170,5 +170,5 @@ def subdivided_mesh(mesh: Mesh) -> SubdividedMesh:
     """Subdivide the mesh to edges of `LONGEST` times its extent."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     dense = subdivide(mesh, LONGEST * extent)
-    node = welded(dense.vertices)
+    node = weld_vertices(dense.vertices)
     return SubdividedMesh(dense, node, node[dense.faces], extent)

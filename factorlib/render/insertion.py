@@ -42,7 +42,7 @@ from factorlib.render.ground import Plane, disk, height_over, smooth_step
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
 from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3
-from factorlib.tracing.scene import Channels, denoised, rendered, rgb, rigid, sensor, shape
+from factorlib.tracing.scene import Channels, denoise, render_scene, rgb, rigid, sensor, shape
 
 FADE = 0.5  # outer share of the disc's radius in which shadows fade
 FIT_SAMPLES = 16
@@ -118,7 +118,7 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
     @property
     def sensor(self) -> dict[str, Any]:
         """The photo's camera, for Mitsuba."""
-        return sensor(self.scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=self.scene.near)
+        return sensor(self.scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near_clip=self.scene.near_clip)
 
     def disc(self, material: Reflectance) -> dict[str, Any]:
         """Return the ground about the spot as a Mitsuba disk."""
@@ -145,7 +145,9 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
         """
         photo_light, objects = self.entries
         channels = Channels(hide_emitters=True, guides=guides)
-        return rendered((light or photo_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels)
+        return render_scene(
+            (light or photo_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels
+        )
 
 
 class ShadowMatch(msgspec.Struct, frozen=True):
@@ -194,7 +196,7 @@ class InsertionResult(msgspec.Struct, frozen=True):
     without: Picture
 
 
-def inserted(
+def insert_object(
     insertion: InsertionScene,
     photo: Picture,
     covered: Bool[np.ndarray, "h w"],
@@ -266,14 +268,14 @@ def _lighting(
     shadow = 1 + (shadow - 1) * fade
     if guides_with.size:  # not the photo, nor pixels whose paths miss the object
         clean, with_object = (
-            denoised(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
+            denoise(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
             for noisy, guides in ((shadow, guides_without), (with_object, guides_with))
         )
         shadow = np.where(shadow == 1, 1, clean)
     return without, with_object, shadow
 
 
-def compared_shadow(
+def compare_shadow(
     insertion: InsertionScene, result: InsertionResult, photo: Picture, covered: Bool[np.ndarray, "h w"], samples: int
 ) -> ShadowMatch:
     """Compare the photo's own shadow with L₀, on the ground near its objects.
@@ -326,7 +328,7 @@ def _coverage(insertion: InsertionScene, samples: int) -> Float[np.ndarray, "h w
             sides.append(Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True))
         for number, side in enumerate(sides):
             entries[f"{new.name}_{label}_{number}"] = shape(side, surface, new.world_from_object, emitter)
-    coverage = np.clip(rendered(entries, insertion.sensor, samples, 1, 1)[..., 0], 0, 1)
+    coverage = np.clip(render_scene(entries, insertion.sensor, samples, 1, 1)[..., 0], 0, 1)
     if not coverage.any():
         raise InputError(
             "the new object is invisible: it stands outside the picture, or other objects hide it",

@@ -15,14 +15,14 @@ from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import apply_tone, invert_tone
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import GroundSurface
 from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, identity_tone, with_sun
-from factorlib.results.lobe_table import light_of
+from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface_table import read_surface
@@ -130,7 +130,7 @@ class SolvedSet:
             )
         return pixel[0] / factor, pixel[1] / factor
 
-    def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
+    def photo_mask(self, photo: str) -> Bool[np.ndarray, "h w"]:
         """Return a mask of the pixels that are not background."""
         channels = self._masks(photo)
         return (channels["label"] > 0) | (channels["left_out"] > 0)
@@ -144,7 +144,7 @@ class SolvedSet:
         """Return a photo's light in its camera's axes, or the light of a file."""
         if is_light_file(name):
             return read_light_map(self.inputs.file(f"recipe file:{name}"))
-        return light_of(self.inputs["export"], name, self.lights[name])
+        return read_photo_light(self.inputs["export"], name, self.lights[name])
 
     def with_table(self, table: str | None) -> dict[str, Reflectance]:
         """Return the solved materials, replaced and extended by those of a table file."""
@@ -243,7 +243,7 @@ class SolvedSet:
         pose = poses.objects[obj.name]
         mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
-        return PlacedMesh(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
+        return PlacedMesh(obj.name, scale_mesh(mesh, pose.scale), tuple(self.names), place)
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:

@@ -29,7 +29,7 @@ from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.poses import AS_IT_IS
-from factorlib.tracing.scene import sharpened
+from factorlib.tracing.scene import sharpen_lobes
 
 MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
 LONGEST = 0.08  # longest edge, in extents of the mesh
@@ -40,7 +40,7 @@ FACES = (32, 64, 128, 256)  # possible numbers of texels across a face of the cu
 FINE_ENOUGH = 0.7  # largest texel, in widths 1/√λ of the sharpest lobe
 
 
-def viewed(
+def viewer_data(
     run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]
 ) -> dict[str, Any] | None:
     """Return the viewer's data; None if no light or no material was exported.
@@ -77,15 +77,15 @@ def viewed(
 
 def _light(lobes: Lobes) -> dict[str, Any]:
     texel = FINE_ENOUGH / np.sqrt(lobes.sharpness.max(initial=1.0))
-    face = next((n for n in FACES if spacing_of(n) <= texel), FACES[-1])
-    lobes = sharpened(lobes, spacing_of(face)).turned(YUP_FROM_CAMERA)
+    face = next((n for n in FACES if texel_spacing(n) <= texel), FACES[-1])
+    lobes = sharpen_lobes(lobes, texel_spacing(face)).rotate(YUP_FROM_CAMERA)
     return {"face": face, "lobes": _base64(np.column_stack([lobes.axis, lobes.sharpness, lobes.weight]), "<f4")}
 
 
-def spacing_of(face: int) -> float:
+def texel_spacing(face: int) -> float:
     """Return the mean angle between texels of a cube map, in radians.
 
-    >>> round(spacing_of(64), 4)
+    >>> round(texel_spacing(64), 4)
     0.0226
     """
     return float(np.sqrt(4 * np.pi / (6 * face**2)))
@@ -163,7 +163,7 @@ def _mesh(
     vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
-    pieces = [_simplified(part, share) for _, part in sorted(parts.items())]
+    pieces = [_simplify(part, share) for _, part in sorted(parts.items())]
     vertices, normals, faces = zip(*pieces, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
     labels = np.arange(1, len(pieces) + 1, dtype=np.int16)
@@ -247,7 +247,7 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     }
 
 
-def _simplified(
+def _simplify(
     part: trimesh.Trimesh, share: float
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Return vertices, normals and triangles of a part, simplified to `share` of its triangles by quadric error."""

@@ -93,7 +93,7 @@ class PhotoPoses(msgspec.Struct, frozen=True):
     objects: dict[str, ObjectPose]
 
 
-def entry_of(pose: Pose) -> dict[str, Any]:
+def pose_fields(pose: Pose) -> dict[str, Any]:
     """Return the fields of a `PoseEntry`."""
     return {"rotation": tuple(map(vec3, pose.rotation)), "translation": vec3(pose.translation)}
 

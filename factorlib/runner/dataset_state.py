@@ -11,7 +11,7 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
+from factorlib.runner.plan import Listing, PlannedStep, Record, Spec, Step, plan
 from factorlib.runner.project import (
     ALL,
     MOST_CORES,
@@ -24,7 +24,7 @@ from factorlib.runner.project import (
     read_pipeline,
     with_settings,
 )
-from factorlib.runner.results_folder import ResultsFolder, results_of, set_link, view_of
+from factorlib.runner.results_folder import ResultsFolder, make_view, results_of, set_link
 from factorlib.runner.step_records import StepInputs, step_records
 from factorlib.runner.store import Store
 from factorlib.wholefile import replace_file
@@ -69,7 +69,7 @@ class DatasetState:
     recipes: dict[str, Recipe]
     settings: Sequence[str]
 
-    def plan(self, forced: frozenset[Step] | None = None) -> list[Planned]:
+    def plan(self, forced: frozenset[Step] | None = None) -> list[PlannedStep]:
         """Plan every step; `forced` replaces the spec's steps that must run."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
@@ -91,7 +91,7 @@ class DatasetState:
                 faults += self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)
         return list(dict.fromkeys(map(str, faults)))
 
-    def parameter_faults(self, planned: list[Planned]) -> list[str]:
+    def parameter_faults(self, planned: list[PlannedStep]) -> list[str]:
         """List the faults of the parameters of steps that are not current.
 
         Only stages with parameters are imported, each in a process, because that takes seconds.
@@ -108,7 +108,7 @@ class DatasetState:
         # A module that cannot be loaded reports that when it runs.
         return [str(blame_setting(error, self.settings)) for error in errors if isinstance(error, InputError)]
 
-    def publish(self, planned: list[Planned]) -> None:
+    def publish(self, planned: list[PlannedStep]) -> None:
         """Make the links in the results folder, and current.json, name the current results."""
         stages = self.spec.pipeline.stages
         current = {p.step: p for p in planned if p.status == "current"}
@@ -116,7 +116,7 @@ class DatasetState:
         links = {str(step): self.store.trees / p.output for step, p in current.items() if not step.photo}
         for name in (name for name, stage in stages.items() if stage.over == "photo"):
             if outputs := {step.photo: p.output for step, p in current.items() if step.photo and step.stage == name}:
-                links[name] = view_of(self.store, outputs, stages[name].gather)
+                links[name] = make_view(self.store, outputs, stages[name].gather)
         for name, folder in links.items():
             set_link(self.results.folder / name, folder, self.project.build)
         for link in self.results.folder.glob("[!.]*"):  # Hidden ones are drafts of links, perhaps of another run.

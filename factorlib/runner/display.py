@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, TextIO, cast
 
-from factorlib.runner.plan import Planned, Step
+from factorlib.runner.plan import PlannedStep, Step
 
 BEAT = 10.0  # seconds of silence after which progress is a line, away from a terminal
 
@@ -84,7 +84,7 @@ class Display:
         self._line_time = time.monotonic()
         self._bars.start()
 
-    def plan(self, planned: list[Planned]) -> None:
+    def plan(self, planned: list[PlannedStep]) -> None:
         """Show the state of a plan."""
         self.stages = {}
         for p in planned:

@@ -124,7 +124,7 @@ def set_link(link: Path, target: Path, build: Path) -> None:
     os.replace(draft, link)
 
 
-def view_of(store: Store, outputs: Mapping[str, str], gather: str | None) -> Path:
+def make_view(store: Store, outputs: Mapping[str, str], gather: str | None) -> Path:
     """Return the folder with the files of all photos of a stage ({photo: output}), as hard links.
 
     The contents of all `<photo>.json` are also in the file `gather`.

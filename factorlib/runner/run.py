@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 from factorlib.errors import InputError
 from factorlib.runner.dataset_state import DatasetState
 from factorlib.runner.display import Display
-from factorlib.runner.plan import Planned, Step
-from factorlib.runner.results_folder import view_of
+from factorlib.runner.plan import PlannedStep, Step
+from factorlib.runner.results_folder import make_view
 from factorlib.runner.run_folder import begin_run
 from factorlib.runner.store import lock
 from factorlib.runner.worker import Outcome, StageCode, Task, Workers, run_step
@@ -81,7 +81,7 @@ class Run:
         self.completed: set[Step] = set()
         self.failed: dict[Step, Outcome] = {}
         self.held_up: list[Step] = []
-        self.planned: dict[Step, Planned] = {}
+        self.planned: dict[Step, PlannedStep] = {}
         self.stale = True  # There are results that the plan does not know.
 
     def execute(self) -> None:
@@ -107,7 +107,7 @@ class Run:
             error = f"{p.reasons[0]}, although it was made in this run: is the disk failing?"
             self._fail(p.step, Outcome(error=error))
 
-    def _start(self, planned: Planned) -> None:
+    def _start(self, planned: PlannedStep) -> None:
         """Start a step if its cores and its lock are free."""
         step = planned.step
         code = self.state.code(step.stage)
@@ -129,7 +129,7 @@ class Run:
             future = self.workers.submit(cores, code.threads, run_step, task)
             self.running[step] = RunningStep(step, task, taken, future)
 
-    def _task(self, planned: Planned, code: StageCode) -> Task:
+    def _task(self, planned: PlannedStep, code: StageCode) -> Task:
         step = planned.step
         stage = self.state.spec.pipeline.stages[step.stage]
         inputs = self.state.inputs[step]
@@ -156,7 +156,7 @@ class Run:
         if not stage.over or step.photo is not None:
             return self.store.trees / self.planned[Step(name, step.photo if stage.over else None)].output
         outputs = {each.item: self.planned[each].output for each in spec.steps_of(name)}
-        return view_of(self.store, outputs, stage.gather)
+        return make_view(self.store, outputs, stage.gather)
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """Write the logs of the current results of all stages above, whichever run made them."""

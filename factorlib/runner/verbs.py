@@ -21,7 +21,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.dataset_state import DatasetState, Request, read_state
-from factorlib.runner.plan import Planned, Step, difference, summarize
+from factorlib.runner.plan import PlannedStep, Step, difference, summarize
 from factorlib.runner.project import RESERVED, Pipeline, Project, StageCode, check_name, read_pipeline
 from factorlib.runner.results_folder import ResultsFolder, all_results, find_results, results_of
 from factorlib.runner.store import Entry, Store, is_locked
@@ -85,7 +85,7 @@ def _print_results(state: DatasetState, whole: bool) -> str:
     return verdict
 
 
-def _run(state: DatasetState, planned: list[Planned]) -> int:
+def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
     from factorlib.runner.display import Display
     from factorlib.runner.run import run
 
@@ -146,7 +146,7 @@ def show_status(project: Project, request: Request) -> int:
     return 0
 
 
-def _result(state: DatasetState, planned: Planned) -> Entry | None:
+def _result(state: DatasetState, planned: PlannedStep) -> Entry | None:
     """Return the result of a current step."""
     return state.store.entry(planned.key) if planned.status == "current" else None
 
@@ -307,7 +307,7 @@ def _changes(store: Store, first: dict[str, str], second: dict[str, str]) -> lis
 
 def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int:
     """Pack a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
-    from factorlib.pack import pack as write_zip
+    from factorlib.pack import write_pack as write_zip
 
     if not (folders := find_results(project, dataset)):
         raise InputError(f"{dataset} has no results", key="DATASET", cure=project.command("all", dataset))
@@ -331,7 +331,7 @@ BOUNDS = {
 }
 
 
-def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
+def plan_lines(planned: list[PlannedStep], every_reason: bool = False) -> list[str]:
     """Format a plan, with one line for all steps of a stage that have the same reasons but for the photo's name.
 
     every_reason: add a line for each reason

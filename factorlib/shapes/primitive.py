@@ -23,7 +23,7 @@ from factorlib.align.refine import DAMPING, PoseState, normal_equations, render
 from factorlib.align.search import SearchOptions, estimate_pose
 from factorlib.align.silhouette import Target, make_target
 from factorlib.geometry.raster import Caster
-from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.shapes.outline import Outline, Triangles
 
 # initial factors of the axes
@@ -104,7 +104,7 @@ def fit_proportions(
     jacobian = partial(jacobian_with_shape, free=free)
     for k in range(steps + 1):
         factors = np.exp(free @ shape)
-        caster = Caster(scaled(mesh, tuple(factors)))
+        caster = Caster(scale_mesh(mesh, tuple(factors)))
         renderings = [render(caster, target, state) for target, state in zip(targets, states, strict=True)]
         if (score := float(np.mean([rendering.score for rendering in renderings]))) > best[1]:
             best = factors, score
@@ -113,7 +113,7 @@ def fit_proportions(
         equations = [normal_equations(rendering, jacobian) for rendering in renderings]
         by_shape, moves = _joint_step(equations, [target.view.free for target in targets])
         shape = shape + by_shape
-        states = [state.moved(move) for state, move in zip(states, moves, strict=True)]
+        states = [state.apply_step(move) for state, move in zip(states, moves, strict=True)]
         if np.abs(by_shape).max(initial=0.0) < STILL:
             break
     return best

@@ -75,7 +75,7 @@ class Observations(msgspec.Struct, frozen=True):
         return len(self.weight)
 
     @property
-    def half(self) -> Float[np.ndarray, "n 3"]:
+    def half_vector(self) -> Float[np.ndarray, "n 3"]:
         """Half vector of the paper, (2(n·o)n − o + (0, 0, −1)) / 2, camera frame, from normals and views as float32."""
         return half_of_normal_and_view(self.normal.astype("f4").astype("f8"), self.view.astype("f4").astype("f8"))
 
@@ -118,7 +118,7 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     """Write the fixed Parquet columns, and `confidence`, `place`, `visibility` and `met` if they are present."""
     columns = {}
     for name, dtype in {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}.items():
-        if (values := getattr(observations, name)) is not None:
+        if (values := getattr(observations, "half_vector" if name == "half" else name)) is not None:
             values = np.ascontiguousarray(values, dtype=dtype)
             flat = pa.array(values.reshape(-1))
             columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat

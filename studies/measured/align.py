@@ -61,15 +61,15 @@ def posed_photo(kind: str, shape: str, seed: int, number: int) -> PosedPhoto:
     """Return the photo of that kind; the same one for the same arguments."""
     rng = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode()))
     fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
-    camera, pose, label = photograph(bodies.mesh(shape), rng, fill)
-    truth = rasterise(bodies.mesh(shape), camera, pose)
-    mesh = bodies.rough(shape, seed) if kind == "rough" else bodies.mesh(shape)
+    camera, pose, label = photograph(bodies.photographed_mesh(shape), rng, fill)
+    truth = rasterise(bodies.photographed_mesh(shape), camera, pose)
+    mesh = bodies.rough_mesh(shape, seed) if kind == "rough" else bodies.photographed_mesh(shape)
     if kind == "mirrored mask":
         label = label[:, ::-1]
     if kind == "wrong mask":
         label = _blot(label, mesh.labels, rng)
     if kind == "wrong mesh":
-        mesh = bodies.mesh(str(rng.choice([other for other in SHAPES if other != shape])))
+        mesh = bodies.photographed_mesh(str(rng.choice([other for other in SHAPES if other != shape])))
         label = np.minimum(label, max(mesh.labels))
     return PosedPhoto(camera, pose, np.ascontiguousarray(label), mesh, truth)
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from factorlib.conventions import FRONT, half_of_normal_and_view
-from factorlib.generate.lobe_spheres import random_spheres, rendered
+from factorlib.generate.lobe_spheres import random_spheres, render_spheres
 from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED, write_layers
@@ -30,7 +30,7 @@ def main() -> None:
     torch.set_num_threads(1)  # sums depend on it
     rng = np.random.default_rng(0)
     light = random_spheres(rng, SPHERES)
-    pixels = rendered(light, PIXELS, rng)
+    pixels = render_spheres(light, PIXELS, rng)
     each = (light.axis[:, None], light.sharpness[:, None], light.roughness[:, None])
     vectors = (pixels.normal, half_of_normal_and_view(pixels.normal, FRONT), *each)
     shape = pixels.normal.shape[:2]

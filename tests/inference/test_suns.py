@@ -12,7 +12,7 @@ from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.lights import UnitLobes
 from factorlib.inference.model_selection import CLEARLY_AGAINST
 from factorlib.inference.suns import WIDE_SHARPNESS, accept_sun, compare_illuminations, replace_brightest, select_suns
-from factorlib.light.lobes import SUN, lobe_integral
+from factorlib.light.lobes import SUN, lobe_energy
 from factorlib.results.materials import Decision
 from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells, spheres
@@ -29,11 +29,11 @@ def solved(irradiance: float, seed: int):
     """Spheres under a sky drawn from the prior and a sun; the true irradiance by the sun in the blocks' unit; and the illumination and the fit
     that a solve without suns ends with, materials as they are."""
     sky = on_even_cells(drawn(seed, FEW))
-    energy = irradiance * sky.energy.sum(0) / lobe_integral(np.array([SUN]))
+    energy = irradiance * sky.energy.sum(0) / lobe_energy(np.array([SUN]))
     problem = spheres([(sky.with_lobes(SUN_LOBE, energy) if irradiance else sky)], size=24, seed=seed)
     fit = fit_problem(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
     (one,) = problem.illuminations(fit.point)
-    return problem, energy * lobe_integral(np.array([SUN])) / problem.blocks[0].unit, one, fit
+    return problem, energy * lobe_energy(np.array([SUN])) / problem.blocks[0].unit, one, fit
 
 
 def tried(irradiance: float, seed: int):
@@ -79,7 +79,7 @@ def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share,
     """Whatever the observations say."""
     monkeypatch.setattr(suns, "compare_illuminations", lambda *_: Decision(True, 1.0, 2.0, 9.0))
     one = solved(0.0, 1)[2]
-    total = one.light.energy.sum() / lobe_integral(np.array([SUN]))[0]
+    total = one.light.energy.sum() / lobe_energy(np.array([SUN]))[0]
     weight = total * share * np.array(colour) / sum(colour)
     lit = msgspec.structs.replace(one, light=one.light.with_lobes(SUN_LOBE, weight))
     assert accept_sun(one, lit).accepted == kept

@@ -20,17 +20,17 @@ from factorlib.inference.surface_turns import (
     LARGEST_TURN,
     LEAST_VIEW_COSINE,
     PULL_SHARE,
-    Attached,
     Detail,
     Stiffness,
+    SurfacePositions,
     Surfaces,
     attach_pixels,
     linearise_light,
     solve_detail,
 )
-from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
-from factorlib.results.poses import ObjectPose, entry_of
+from factorlib.results.poses import ObjectPose, pose_fields
 from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, light_of, on_even_cells, photographed, spheres
@@ -49,14 +49,16 @@ def surfaces(subdivisions: int = 3) -> Surfaces:
     )
 
 
-def attached_to(normal: np.ndarray, body: Surfaces) -> Attached:
+def attached_to(normal: np.ndarray, body: Surfaces) -> SurfacePositions:
     """Points of the ball by their normals: at each the nearest triangle, whose corners count by their nearness."""
     (one,) = body.meshes.values()
     place, rotation = np.zeros((one.nodes, 3)), TURN
     place[one.node] = one.mesh.vertices
     face = ((normal @ rotation) @ place[one.faces].mean(1).T).argmax(1)
     share = np.exp(30 * (np.einsum("nd,nkd->nk", normal @ rotation, place[one.faces[face]]) - 1))
-    return Attached(one.faces[face], share / share.sum(1, keepdims=True), np.tile(rotation, (len(normal), 1, 1)))
+    return SurfacePositions(
+        one.faces[face], share / share.sum(1, keepdims=True), np.tile(rotation, (len(normal), 1, 1))
+    )
 
 
 def wrong(normal: np.ndarray, size: float) -> np.ndarray:
@@ -266,7 +268,7 @@ def ball(offset=0.0) -> Mesh:
 
 def entry(pose: Pose, scale=(1.0, 1.0, 1.0)) -> ObjectPose:
     """An entry of poses.json."""
-    return ObjectPose(**entry_of(pose), scale=scale)
+    return ObjectPose(**pose_fields(pose), scale=scale)
 
 
 def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
@@ -275,7 +277,7 @@ def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
     turns = [turn * np.sign(np.linalg.det(turn)) for turn in turns]
     poses = [Pose(turns[0], np.array([-1.2, 0, 5.0])), Pose(turns[1], np.array([1.3, 0.2, 6.0]))]
     meshes, scale = {"apple": ball(), "pear": ball(0.3)}, (1.0, 1.2, 0.8)
-    maps = rasterise([meshes["apple"], scaled(meshes["pear"], scale)], CAMERA, poses)
+    maps = rasterise([meshes["apple"], scale_mesh(meshes["pear"], scale)], CAMERA, poses)
     surfaces = Surfaces({name: subdivided_mesh(mesh) for name, mesh in meshes.items()})
     objects = {"a": ("apple", entry(poses[0])), "b": ("pear", entry(poses[1], scale))}
     y, x = np.nonzero(maps.object >= 0)

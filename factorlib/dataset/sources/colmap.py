@@ -32,7 +32,7 @@ Line = TypeVar("Line", CameraLine, ImageLine)
 
 def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the registered images of the model in the dataset's folder `path`, sorted by name."""
-    refuse.subfolder(KEY, path)
+    refuse.check_subfolder(KEY, path)
     pairs = [
         (refuse.file_in(KEY, path, f"cameras{suffix}"), refuse.file_in(KEY, path, f"images{suffix}"))
         for suffix in (".bin", ".txt")
@@ -62,7 +62,7 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
         key = f"{KEY}: {one_line(name)}"
         camera = made[camera_id]
         length = math.hypot(*quaternion)
-        refuse.when(
+        refuse.refuse_if(
             not (0 < length <= LARGEST and max(abs(x), abs(y), abs(z)) <= LARGEST and not math.isnan(x + y + z)),
             key,
             "is no pose: its numbers are zero, not finite or too large",

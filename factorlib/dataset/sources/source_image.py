@@ -75,13 +75,13 @@ def colmap_camera(
         refuse: raises errors
     """
     fault = f"is no camera: {width:g}×{height:g} pixels, {model} {', '.join(f'{x:g}' for x in params)}"
-    refuse.when(
+    refuse.refuse_if(
         not (1 <= width <= SIDE_PX and 1 <= height <= SIDE_PX),
         key,
         fault,
         f"an image is 1 to {SIDE_PX:g} pixels wide and high; {DAMAGED}",
     )
-    refuse.when(not all(abs(x) <= LARGEST for x in params), key, fault, DAMAGED)
+    refuse.refuse_if(not all(abs(x) <= LARGEST for x in params), key, fault, DAMAGED)
     return pycolmap.Camera(model=model, width=round(width), height=round(height), params=list(params))
 
 
@@ -131,7 +131,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
     return focal, centre
 
 
-def rigid(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
+def rigid_motion(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
     """Return the rigid motion of a rotation matrix (made orthonormal) and a translation."""
     turn = pycolmap.Rotation3d(rotation)
     turn.normalize()
