@@ -160,7 +160,7 @@ class Refusal:
 
     def _check_plain(self, key: str, path: str, target: Path) -> None:
         try:
-            check_check_plain(target, "a file", key, most_bytes=None)
+            check_plain(target, "a file", key, most_bytes=None)
         except InputError as error:
             self(key, f"{path!r} {error.fault}", error.cure or "correct the path")
 

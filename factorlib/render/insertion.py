@@ -42,7 +42,7 @@ from factorlib.render.ground import Plane, disk, height_over, smooth_step
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
 from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3
-from factorlib.tracing.scene import Channels, denoise, render_scene, rgb, rigid, sensor, shape
+from factorlib.tracing.scene import Channels, denoise_picture, render_scene, rgb, rigid, sensor, shape
 
 FADE = 0.5  # outer share of the disc's radius in which shadows fade
 FIT_SAMPLES = 16
@@ -268,7 +268,7 @@ def _lighting(
     shadow = 1 + (shadow - 1) * fade
     if guides_with.size:  # not the photo, nor pixels whose paths miss the object
         clean, with_object = (
-            denoise(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
+            denoise_picture(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
             for noisy, guides in ((shadow, guides_without), (with_object, guides_with))
         )
         shadow = np.where(shadow == 1, 1, clean)

@@ -278,7 +278,7 @@ def cube_map_lookup(faces: dict[str, np.ndarray], directions: Float[np.ndarray, 
     return values
 
 
-def denoise(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]:
+def denoise_picture(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]:
     """Denoise linear radiance times coverage; coverage is left unchanged.
 
     `picture` holds radiance, coverage, and the guides of `factorlib.tracing.scene.render_scene`, all times coverage.
