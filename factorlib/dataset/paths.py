@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.reading import path_inside, reading
+from factorlib.reading import check_plain, path_inside, reading
 
 ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1, which matrices typed with four digits satisfy
 
