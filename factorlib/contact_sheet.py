@@ -43,7 +43,7 @@ MOST_PHOTOS = 100
 Pixels = UInt8[np.ndarray, "h w 3"]
 
 
-def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda done, total: None) -> None:
+def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda index, total: None) -> None:
     """Write the contact sheet of the dataset in a folder as a PNG, of its first MOST_PHOTOS photos.
 
     Photos and meshes that cannot be read are left out, because `validate` reports them.
@@ -60,13 +60,13 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
     names = list(dict.fromkeys([*spec.materials, *[OPEN] * bool(faults)]))
     photos = spec.photos[:MOST_PHOTOS]
     pictures = []
-    for done, photo in enumerate(photos):
-        report(done, 2 * len(photos))
+    for index, photo in enumerate(photos):
+        report(index, 2 * len(photos))
         pictures.append(_photo(folder, spec, photo))
     colours = _colours(names, [(image, labels) for image, labels in pictures if labels is not None])
     rows = []
-    for done, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
-        report(len(photos) + done, 2 * len(photos))
+    for index, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
+        report(len(photos) + index, 2 * len(photos))
         named = [(photo.name, image)]
         if labels is not None:
             named.append(("labels", _colour_labels(image, labels, colours)))

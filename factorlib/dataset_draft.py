@@ -306,16 +306,16 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
             continue
         for photo in spec["photos"]:
             for obj in photo["objects"]:
-                alone = "mask" in obj or len(photo["objects"]) == 1
-                if obj["mesh"] == name and alone and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
+                is_separate = "mask" in obj or len(photo["objects"]) == 1
+                if obj["mesh"] == name and is_separate and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
                     with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
                         silhouettes.append(_silhouette(photo, obj, materials, file))
                         objects.append((photo["name"], obj))
         mesh = read_mesh(file(entry["file"]), list(part_materials), {part: part for part in part_materials})
-        told = match_parts(mesh, len(part_materials), silhouettes)
+        matches = match_parts(mesh, len(part_materials), silhouettes)
         for k, part in [(k, part) for k, part in enumerate(part_materials) if part_materials[part] == UNKNOWN]:
-            ranked = [paired.labels[k] if paired else [] for paired in told]
-            margins = [paired.margins[k] if paired else 0.0 for paired in told]
+            ranked = [paired.labels[k] if paired else [] for paired in matches]
+            margins = [paired.margins[k] if paired else 0.0 for paired in matches]
             sure = [margin >= MARGIN and each[0] != HIDDEN for margin, each in zip(margins, ranked)]
             likely = [" or ".join(materials[label - 1] for label in each if label != HIDDEN) for each in ranked]
             if not any(sure):
@@ -385,8 +385,8 @@ def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool 
 def _by_name(paths: list[Path], key: str) -> dict[str, Path]:
     named: dict[str, Path] = {}
     for path in paths:
-        if (other := named.setdefault(name := _word(path.stem), path)) != path:
-            fault = f"{path.name} and {other.name} would both be called {name!r}"
+        if (namesake := named.setdefault(name := _word(path.stem), path)) != path:
+            fault = f"{path.name} and {namesake.name} would both be called {name!r}"
             raise InputError(fault, file=path, key=key, cure="rename one of them")
     return named
 

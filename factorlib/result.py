@@ -223,9 +223,9 @@ class Result:
         scene = resize_scene(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == obj)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
-        of_photo = light if isinstance(light, str) and light in self.photos else None
+        light_photo = light if isinstance(light, str) and light in self.photos else None
         about = f"{photo}/{obj} in {light if isinstance(light, str) else 'a given light'}"
-        return Picture(traced, identity_tone if of_photo is None else self._solved.tone(of_photo), about)
+        return Picture(traced, identity_tone if light_photo is None else self._solved.tone(light_photo), about)
 
     def insert(self, photo: str, **fields: Any) -> RenderedFiles:
         """Insert a further object on the ground of a photo, with its shadow.
@@ -272,8 +272,8 @@ class Result:
         inputs = self._solved.inputs
         objects = {name: each.objects for name, each in self._solved.objects.items()}
         check_recipe(recipe, path, objects, self._solved.names)
-        given = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
-        solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | given))
+        recipe_files = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
+        solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | recipe_files))
         with TemporaryDirectory() as out:
             draw(recipe, solved, Path(out), silent)
             files = sorted(path for path in Path(out).rglob("*") if path.is_file())

@@ -88,8 +88,8 @@ def install_packages() -> None:
     """
     index = os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
     pip("--no-deps", "-r", str(LOCK))
-    alone = ["--no-deps"] if index == TORCH_CPU else ["-c", str(LOCK)]
-    pip(*alone, TORCH, *(["--index-url", index] if index else []))
+    options = ["--no-deps"] if index == TORCH_CPU else ["-c", str(LOCK)]
+    pip(*options, TORCH, *(["--index-url", index] if index else []))
     # The path is relative, so that the checkout can be moved.  `import factorlib` then works from anywhere.
     next(VENV.glob("lib/python*/site-packages")).joinpath("factorlib.pth").write_text("../../../..\n")
 

@@ -64,16 +64,16 @@ class Validation:
 
     def cautions(self) -> list[str]:
         """Return warnings about what no photo can determine, from the materials that dataset.yaml names."""
-        together: dict[str, set[str]] = {}
+        by_light: dict[str, set[str]] = {}
         for photo in self.spec.photos:
-            together.setdefault(photo.light, set()).update(
+            by_light.setdefault(photo.light, set()).update(
                 *(instance_materials(obj, self.spec) for obj in photo.objects)
             )
-        component = material_components({light: sorted(names) for light, names in together.items() if names})
+        component = material_components({light: sorted(names) for light, names in by_light.items() if names})
         if (groups := len(set(component.values()))) < 2:
             return []
-        lights = sorted(light for light, names in together.items() if names)
-        members = [[light for light in lights if component[min(together[light])] == k] for k in range(groups)]
+        lights = sorted(light for light, names in by_light.items() if names)
+        members = [[light for light in lights if component[min(by_light[light])] == k] for k in range(groups)]
         group_list = "; ".join(map(", ".join, members))
         return [
             f"the lights fall into {groups} groups that share no material ({group_list}): "
@@ -112,8 +112,8 @@ class Validation:
         """Check that a mirror ball is round: its vertices are equally far from the centre of its bounding box."""
         if (file := self.spec.meshes[obj.mesh].file) is None:
             return
-        made = self.spec.meshes[obj.mesh].part_materials
-        points = read_mesh(self.file(file), self.spec.materials, made, obj.materials).vertices
+        part_materials = self.spec.meshes[obj.mesh].part_materials
+        points = read_mesh(self.file(file), self.spec.materials, part_materials, obj.materials).vertices
         radius = np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1)
         if np.ptp(radius) > NOT_ROUND * radius.max():
             raise InputError(

@@ -135,16 +135,16 @@ def read_objects(
     materials = inputs.facts["dataset.materials"]
     for number, entry in enumerate(slice_.objects, start=1):
         mesh_entry = slice_.meshes[entry.mesh]
-        given = entry.pose
+        fixed_pose = entry.pose
         keypoints = None
-        if given is None and slice_.external:
-            given = slice_.external.poses.get(entry.name)
-        before = earlier.objects.get(entry.name) if earlier and given is None else None
+        if fixed_pose is None and slice_.external:
+            fixed_pose = slice_.external.poses.get(entry.name)
+        before = earlier.objects.get(entry.name) if earlier and fixed_pose is None else None
         file = inputs.mesh(entry.mesh, mesh_entry.file)
         scale = before.scale if before else AS_IT_IS
         mesh = read_mesh(file, materials, mesh_entry.part_materials, entry.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, mesh.labels, entry.mask is not None)
-        pose = Pose(np.array(given.rotation), np.array(given.translation)) if given is not None else None
+        pose = Pose(np.array(fixed_pose.rotation), np.array(fixed_pose.translation)) if fixed_pose is not None else None
         if entry.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
             pixels = np.array([keypoint.pixel for keypoint in entry.keypoints]) / factor
             points = np.array([keypoint.point for keypoint in entry.keypoints])

@@ -61,12 +61,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
     materials = inputs.facts["dataset.materials"]
-    done = count()
+    counter = count()
     total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
 
     def read_photo(name: str) -> ComparedPhoto:
         """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
-        progress(next(done), total, f"re-synthesis of {name}")
+        progress(next(counter), total, f"re-synthesis of {name}")
         photo = read_exr(inputs["masks"] / f"{name}.exr")
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
         return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
@@ -89,9 +89,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             "poses": lambda: _poses(inputs, truth),
         }
         for name, section in compute.items():
-            progress(next(done), total, name)
+            progress(next(counter), total, name)
             sections[name] = section()
-    progress(next(done), total, "verdict")
+    progress(next(counter), total, "verdict")
     sections["verdict"] = _verdict(inputs, observed)
     counts = Counts(len(lights), len(materials), len(observed), len(set(component.values())))
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}

@@ -74,8 +74,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     meshes = dict(sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()))
     total = 1 + len({light.illumination for light in slices.values()}) + len(meshes) + len(slices)
-    done = count()
-    progress(next(done), total, "materials")
+    counter = count()
+    progress(next(counter), total, "materials")
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
     table, solved, exposures = _solution_in_gauge(inputs["solve"], slices)
@@ -85,11 +85,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     _write_tables(out, materials, solved)
     _write_dataset(out, inputs)
     for name, lobes in solved.items():
-        progress(next(done), total, f"light of {name}")
+        progress(next(counter), total, f"light of {name}")
         _write_light(out, name, lobes, inputs["solve"] / "coverage" / f"{name}.exr", params)
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
     for name, mesh in meshes.items():
-        progress(next(done), total, f"mesh {name}")
+        progress(next(counter), total, f"mesh {name}")
         overrides = [o.materials for each in objects.values() for o in each.objects if o.mesh == name and o.materials]
         labels = {variant_name(each): files.read.mesh(name, mesh, each).face_label for each in overrides}
         whole = files.read.mesh(name, mesh)
@@ -99,7 +99,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     poses = read_poses(inputs["align"] / "poses.json")
     depth = ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, slice_ in slices.items():
-        progress(next(done), total, f"scene of {photo}")
+        progress(next(counter), total, f"scene of {photo}")
         height, width = read_exr(inputs["align"] / f"{photo}.exr")["label"].shape
         camera = poses[photo].camera.camera(width, height)
         placed = objects[photo]

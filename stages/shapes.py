@@ -50,15 +50,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     cameras: dict[str, ExternalCamera] = {}
     if slice_.sfm:
         cameras = estimate_cameras(photos, slice_.meshes, lambda share, step: progress(0.5 * share, 1, step))
-    begun = 0.5 if slice_.sfm else 0.0
-    part = (1 - begun) / max(len(slice_.meshes), 1)
+    first_share = 0.5 if slice_.sfm else 0.0
+    part = (1 - first_share) / max(len(slice_.meshes), 1)
     shapes = {}
     (out / "meshes").mkdir()
-    for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):
+    for index, (name, entry) in enumerate(sorted(slice_.meshes.items())):
         outlines = [each for photo in photos.values() for each in photo.outlines(name, entry, cameras.get(photo.name))]
         outlines = [outline for outline in outlines if outline.is_visible]
         try:
-            shape = estimate_shape(entry, outlines, params, _share(begun + part * done, part, name, progress))
+            shape = estimate_shape(entry, outlines, params, _share(first_share + part * index, part, name, progress))
         except InputError as error:
             raise InputError(error.fault, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_obj(out / "meshes" / f"{name}.obj", shape, shape_parts(entry))
@@ -139,7 +139,7 @@ def estimate_shape(
         is_posed = any(outline.pose is not None for outline in outlines)
         return shape if is_posed else msgspec.structs.replace(shape, vertices=shape.vertices * entry.size)
     assert entry.primitive is not None  # the reader accepts no other mesh without a file
-    return primitive(entry.primitive, outlines, report).of_size(entry.size)
+    return primitive(entry.primitive, outlines, report).with_size(entry.size)
 
 
 class MaskedPhoto:

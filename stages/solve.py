@@ -105,11 +105,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     _warn(before_solving(names, observations.photos, problem))
     solution = _run_solver(params, problem, earlier, inputs, partial(_share, progress))
     systems = 2 * len(problem.blocks)
-    made = count(1)
+    counter = count(1)
 
     def tick() -> None:
         """Report that one more system of normal equations for the standard errors is done."""
-        progress(1 - ERRORS + ERRORS * next(made) / systems, 1, "standard errors")
+        progress(1 - ERRORS + ERRORS * next(counter) / systems, 1, "standard errors")
 
     errors, coverages = estimate_uncertainty(solution, problem, params, tick)
     answer = Answer(names, problem, solution, errors, relative, params.solver, earlier)

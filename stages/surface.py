@@ -193,14 +193,14 @@ def _estimate_surface(
     in_frame = [light.rotate(worlds.get(name, np.eye(3))) for name, light in attached.items()]
     problem = JointProblem(blocks, reflection_operator("network", weights=inputs["train"]), spread=inputs.map)
     nodes = concatenate_positions(in_frame)
-    of_blocks = []
+    positions = []
     for block in blocks:
         assert block.row is not None  # `blocks_of_observations` numbers the observations
-        of_blocks.append(nodes.take(block.row))
+        positions.append(nodes.take(block.row))
     return estimate_surface(
         problem,
         surfaces,
-        of_blocks,
+        positions,
         start_from_photos(len(inputs.facts["dataset.materials"])),
         params.seed,
         lambda share, activity: progress(share, 1, activity),

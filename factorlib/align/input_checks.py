@@ -51,14 +51,14 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
             cure="x_cam = R x_object + t with x right, y down, z forward (OpenGL's camera looks along −z: turn y and z "
             "over); take the object out of photos that do not show it",
         )
-    if behind := int(np.count_nonzero(depth <= 0)):
+    if behind_count := int(np.count_nonzero(depth <= 0)):
         log.warning(
             "%s: %s: its pose (%s) puts %d of its %d vertices behind the camera, which then stands inside it: is it "
             "so, and in the mesh's units?",
             photo,
             name,
             source,
-            behind,
+            behind_count,
             len(depth),
         )
 

@@ -107,8 +107,8 @@ def estimate_pose(
     for other in coarser:
         if len(rivals) < search.rivals and _is_apart(other, (ranked[0], *rivals), DISTINCT_DEG):
             rivals.append(other)
-    again = [refine(caster, target, rival.state, search.steps[-1]) for rival in rivals]
-    best, *others = _rank(ranked + again, view)
+    refined = [refine(caster, target, rival.state, search.steps[-1]) for rival in rivals]
+    best, *others = _rank(ranked + refined, view)
     runner_up = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None)
     second = _describe_runner_up(caster, target, best, runner_up) if runner_up else None
     return PoseEstimate(best.state, best.score, best.log_focal_sigma(), second)
@@ -192,8 +192,8 @@ def render_maps(caster: Caster, target: Target, state: PoseState) -> Maps:
 
 def normal_difference(a: Maps, b: Maps) -> float:
     """Return the median angle in degrees between the normals of common pixels of the mesh; 180 if there are none."""
-    both = (a.label > 0) & (b.label > 0)
-    if not both.any():
+    overlap = (a.label > 0) & (b.label > 0)
+    if not overlap.any():
         return 180.0
-    cosine = np.clip(np.sum(a.normal[both] * b.normal[both], axis=1), -1, 1)
+    cosine = np.clip(np.sum(a.normal[overlap] * b.normal[overlap], axis=1), -1, 1)
     return float(np.rad2deg(np.median(np.arccos(cosine))))

@@ -90,8 +90,8 @@ def label_agreement(silhouette: Silhouette, mesh_label: Labels) -> float:
     >>> label_agreement(Silhouette(np.array([[0, 1, 2]])), np.array([[1, 1, 1]]))
     0.5
     """
-    both = silhouette.inside & (mesh_label > 0)
-    return _share(both & (silhouette.label == mesh_label), both)
+    overlap = silhouette.inside & (mesh_label > 0)
+    return _share(overlap & (silhouette.label == mesh_label), overlap)
 
 
 def labelled_iou(silhouette: Silhouette, mesh_label: Labels) -> float:

@@ -108,9 +108,9 @@ def check_lights(photos: list[PhotoEntry], file: Path) -> None:
     """Check that photos that share a light are all fixed to the camera, or all to the world; else InputError."""
     first: dict[str, PhotoEntry] = {}
     for index, photo in enumerate(photos):
-        other = first.setdefault(photo.light, photo)
-        if (other.world_from_camera is None) != (photo.world_from_camera is None):
-            names = f"{other.name!r} and {photo.name!r}"
+        first_photo = first.setdefault(photo.light, photo)
+        if (first_photo.world_from_camera is None) != (photo.world_from_camera is None):
+            names = f"{first_photo.name!r} and {photo.name!r}"
             Refusal(file, file.parent)(
                 f"photos[{index}].world_from_camera",
                 f"photos {names} share illumination {photo.light!r}, but only one of them has this key",
@@ -393,8 +393,8 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         places = [getattr(keypoint, name) for keypoint in obj.keypoints]
         first: dict[tuple[float, ...], int] = {}
         for index, place in enumerate(places):
-            if (other := first.setdefault(place, index)) != index:
-                refuse(f"{key}[{index}].{name}", f"the same as {key}[{other}]'s", "name each place once")
+            if (first_index := first.setdefault(place, index)) != index:
+                refuse(f"{key}[{index}].{name}", f"the same as {key}[{first_index}]'s", "name each place once")
         # largest distance of a place from the line through the first and the farthest one
         arms = [[x - x0 for x, x0 in zip(place, places[0])] for place in places[1:]]
         longest = max(arms, key=lambda arm: math.hypot(*arm))

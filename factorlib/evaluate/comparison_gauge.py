@@ -86,8 +86,8 @@ def material_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
     >>> material_components({"day": ["red", "white"], "night": ["blue"]})
     {'blue': 0, 'red': 1, 'white': 1}
     """
-    names = sorted({name for together in pairs.values() for name in together})
-    linked = [(names.index(together[0]), names.index(name)) for together in pairs.values() for name in together]
+    names = sorted({name for members in pairs.values() for name in members})
+    linked = [(names.index(members[0]), names.index(name)) for members in pairs.values() for name in members]
     first, second = np.array(linked, dtype=int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(linked)), (first, second)), shape=(len(names), len(names)))
     _, label = components_of_graph(graph, directed=False)

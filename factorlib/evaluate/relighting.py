@@ -201,8 +201,8 @@ def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
     >>> set_factor([(Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3), true)])
     (2.0, 1.0, 1.0)
     """
-    both = np.array([[(m.diffuse, m.specular) for m in pair] for pair in pairs], float)
-    recovered, true = (both[:, k].reshape(-1, 3).T for k in (0, 1))
+    parameters = np.array([[(m.diffuse, m.specular) for m in pair] for pair in pairs], float)
+    recovered, true = (parameters[:, k].reshape(-1, 3).T for k in (0, 1))
     logs = [np.log(t[k]) - np.log(r[k]) for r, t in zip(recovered, true) for k in [(r > 0) & (t > 0)]]
     return vec3(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)
 

@@ -287,6 +287,6 @@ def compose_photo(scene: SyntheticScene, camera: Camera, spp: int, seed: int) ->
         used = np.flatnonzero(mask.any(axis=0))
         columns = slice(used[0], used[-1] + 1)
         entries = {"shape": solid, "light": envmap(scene.light)}
-        alone = render_scene(entries, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2)
-        radiance[:, columns][mask[:, columns]] = alone[mask[:, columns]]
+        rendering = render_scene(entries, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2)
+        radiance[:, columns][mask[:, columns]] = rendering[mask[:, columns]]
     return radiance

@@ -81,15 +81,15 @@ class Occluders(Caster):
             The points.
         """
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
-        distance, face, behind = self._first(self._rays(np.zeros_like(along), along))
+        distance, face, is_back = self._first(self._rays(np.zeros_like(along), along))
         valid = np.isfinite(distance)
         depth = np.where(valid, distance * self.radius, 0.0)
-        normal = self.hit_normals(face, behind)
+        normal = self.hit_normals(face, is_back)
         return SurfacePoints(depth[:, None] * along + self.lift[face][:, None] * normal, normal, valid)
 
-    def hit_normals(self, face: Int[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]) -> Vectors:
-        """Return the normals of faces, flipped where the face is hit from `behind`."""
-        return np.where(behind[:, None], -self.normal[face], self.normal[face])
+    def hit_normals(self, face: Int[np.ndarray, " n"], is_back: Bool[np.ndarray, " n"]) -> Vectors:
+        """Return the normals of faces, flipped where the face is hit from behind."""
+        return np.where(is_back[:, None], -self.normal[face], self.normal[face])
 
     def visibility_at(
         self,
@@ -150,9 +150,9 @@ class Occluders(Caster):
         occluder = np.full(visibility.shape, NO_OCCLUDER, np.uint16)
         material = self.mesh.face_label.astype(np.int64) - 1
         codes = np.array([[*occluder_codes(material, normal), NO_OCCLUDER] for normal in (self.normal, -self.normal)])
-        for row, k, face, behind in self.hidden_from(points, shading_normal, directions, report):
+        for row, k, face, is_back in self.hidden_from(points, shading_normal, directions, report):
             visibility[row, k] = 0
-            occluder[row, k] = codes[behind.astype(int), face]
+            occluder[row, k] = codes[is_back.astype(int), face]
         return Visibility(visibility, occluder)
 
     def hidden_from(
@@ -183,8 +183,8 @@ class Occluders(Caster):
             below = np.maximum(GRAZING - normal @ directions.T, 0)[row, k]
             rays = self._rays(points.place[rows][row], directions[k] + below[:, None] * normal[row])
             hidden = self.scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
-            distance, face, behind = self._first(rays[hidden])
-            yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), behind
+            distance, face, is_back = self._first(rays[hidden])
+            yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), is_back
 
     def _first(self, rays: Float[np.ndarray, "n 6"]) -> tuple[np.ndarray, ...]:
         """Return the first hits of rays: distance in radii (inf for none), face, and whether it is hit from behind."""

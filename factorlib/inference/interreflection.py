@@ -116,7 +116,9 @@ def _bounced_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 3
     code = np.where((hit_code == NO_OCCLUDER) | (hit_code >= unknown), unknown, hit_code).astype(np.int64)
     by_channel = [torch.from_numpy(surfaces[:, c]).float()[torch.from_numpy(code)] for c in range(3)]
     weights = [hidden * reflectance for reflectance in (cosine_weights(normal, directions), highlight)]
-    return np.column_stack([(weight * sent).sum(1).double().numpy() for weight in weights for sent in by_channel])
+    return np.column_stack(
+        [(weight * radiance).sum(1).double().numpy() for weight in weights for radiance in by_channel]
+    )
 
 
 def unit_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -203,13 +203,13 @@ def extract_known(
     lights = {name: light_from_map(lat_long) for name, lat_long in maps.items()}
     for name, ball in declared.balls.items():
         m = number(ball.material)
-        of_photo = observations.photo == observations.photos.index(ball.photo)
+        photo_mask = observations.photo == observations.photos.index(ball.photo)
         pixels = balls[name].take(balls[name].material == m)
-        beside_ball = ~(of_photo & (observations.material == m))
-        if len(pixels) < LEAST_BALL_PIXELS or not (of_photo & beside_ball).any():
+        beside_ball = ~(photo_mask & (observations.material == m))
+        if len(pixels) < LEAST_BALL_PIXELS or not (photo_mask & beside_ball).any():
             fault = (
                 f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
-                f"and {(of_photo & beside_ball).sum()} observations of other objects"
+                f"and {(photo_mask & beside_ball).sum()} observations of other objects"
             )
             cure = f"the ball needs {LEAST_BALL_PIXELS}, and something beside it: look at the overlay of `align`"
             raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)

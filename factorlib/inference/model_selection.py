@@ -176,8 +176,8 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
         if not decision.accepted:
             return SolveState(plain, plain, decision)
     if bounces == "auto":
-        chosen = select_interreflection(sample, fit, run_fit)
-        return SolveState(chosen.fit, chosen.fit, decision, chosen.evidence[0])
+        selection = select_interreflection(sample, fit, run_fit)
+        return SolveState(selection.fit, selection.fit, decision, selection.evidence[0])
     return SolveState(fit, fit, decision, Decision(forced))
 
 
@@ -194,8 +194,8 @@ def select_interreflection(sample: JointProblem, start: Fit, run_fit: Fitting) -
     fits = [run_fit(phase, model, start, BOUNCE_SCHEDULE) for model in models]
     log_bayes_factor = (fits[0].value - fits[1].value) / 2
     decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
-    chosen = int(decision.accepted)
-    return Selection(run_fit(phase, models[chosen], fits[chosen], AFTER_BOUNCES), [decision])
+    index = int(decision.accepted)
+    return Selection(run_fit(phase, models[index], fits[index], AFTER_BOUNCES), [decision])
 
 
 def _log_geometric_mean(losses: Losses) -> float:
@@ -277,9 +277,9 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
     factor = log_bayes_factors.max(0)
     near = {k: float(likely[k]) for k in candidates if factor[k] > VERY_STRONG}
     if near:
-        chosen = fit_with_curvatures(near)
+        near_fit = fit_with_curvatures(near)
         alternatives = (dict.fromkeys(near, 0.0), near)
-        far_values, near_values = (fit_with_curvatures(c, chosen, LIGHTS_ONLY).light_values for c in alternatives)
+        far_values, near_values = (fit_with_curvatures(c, near_fit, LIGHTS_ONLY).light_values for c in alternatives)
         factor = np.minimum(factor, (np.array(far_values) - near_values) / 2)
     for k in candidates:
         evidence[k] = Decision(bool(factor[k] > VERY_STRONG), log_bayes_factor=float(factor[k]))

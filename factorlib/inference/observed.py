@@ -194,5 +194,5 @@ def held_out_by_cells(
         seed: Seed of the random choice.
     """
     names, number = np.unique(cell, return_inverse=True)
-    chosen = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]
-    return chosen & np.isin(material, material[~chosen])
+    is_held_out = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]
+    return is_held_out & np.isin(material, material[~is_held_out])

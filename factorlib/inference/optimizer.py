@@ -200,11 +200,11 @@ class Descent(msgspec.Struct, frozen=True):
 
         def apply_step(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
             """Return θ and the lights after a step of all unknowns."""
-            of_materials, *of_lights = np.split(step, ends)
-            change = of_materials.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
+            material_step, *light_steps = np.split(step, ends)
+            change = material_step.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
             theta = (state.theta + change).clip(LOWER_BOUNDS, UPPER_BOUNDS)
             materials = materials_from_unknowns(theta)
-            steps = zip(state.likelihoods, of_lights, strict=True)
+            steps = zip(state.likelihoods, light_steps, strict=True)
             return theta, [old.with_point(step_light(old.light, step), materials) for old, step in steps]
 
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
@@ -221,8 +221,8 @@ class Descent(msgspec.Struct, frozen=True):
 
         def metric(slope: np.ndarray) -> np.ndarray:
             """Return H⁻¹ times a gradient."""
-            of_materials, *of_lights = np.split(slope, ends)
-            step, lights = arrow.solve(of_materials, of_lights)
+            material_slope, *light_slopes = np.split(slope, ends)
+            step, lights = arrow.solve(material_slope, light_slopes)
             return np.concatenate([step, *lights])
 
         theta, likelihoods = apply_step(

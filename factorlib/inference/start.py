@@ -166,8 +166,8 @@ def insert_known(point: Point, problem: JointProblem) -> Point:
             if known_light := known_lights.get(i):
                 scale = (brighter[i] - factor).mean() * known_light.scale_free - np.log(problem.blocks[i].unit)
                 weight = known_light.weight * np.exp(scale)
-                held = {"fixed": known_light.fixed, "scale_free": known_light.scale_free}
-                parts = {"axis": known_light.axis, "log_sharpness": known_light.log_sharpness, **held}
+                constraints = {"fixed": known_light.fixed, "scale_free": known_light.scale_free}
+                parts = {"axis": known_light.axis, "log_sharpness": known_light.log_sharpness, **constraints}
             if names[i] in known.exposures:
                 parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_fixed": True}
             lights[i] = msgspec.structs.replace(lights[i], weight=weight, **parts)

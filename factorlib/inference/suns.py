@@ -82,8 +82,8 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
             decision = compare_illuminations(with_wide_lobe, with_suns[k], CLEARLY_AGAINST)
             evidence[k] = evidence[k] if decision.accepted else decision
     fits = [trial if decision.accepted else fit for decision in evidence]
-    lights = [chosen.point.lights[k] for k, chosen in enumerate(fits)]
-    hyperparameters = [chosen.hyperparameters[k] for k, chosen in enumerate(fits)]
+    lights = [selected.point.lights[k] for k, selected in enumerate(fits)]
+    hyperparameters = [selected.hyperparameters[k] for k, selected in enumerate(fits)]
     return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 

@@ -402,23 +402,25 @@ def estimate_surface(
     scores = trial.score_photos([plain] * photos, tick)
     search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), scores, tick)
     turned, movable = search.select_turns()
-    chosen = (
+    selected = (
         turned
         if turned.evidence.accepted
         else StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
     )
-    candidates = [Stiffness(chosen.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
+    candidates = [Stiffness(selected.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
     nodes = trial.shared_nodes & surfaces.node_mask(movable)
-    painted = search.select_stiffness(candidates, chosen.scores, (0.0, CLEARLY_FOR), nodes)
-    chosen = painted if painted.evidence.accepted else chosen
+    painted = search.select_stiffness(candidates, selected.scores, (0.0, CLEARLY_FOR), nodes)
+    selected = painted if painted.evidence.accepted else selected
     if not (turned.evidence.accepted or painted.evidence.accepted):
         return SurfaceEstimate(initial, turned.evidence, painted.evidence)
-    gains = dict(zip(trial.names, (scores.values - chosen.scores.values).tolist(), strict=True))
-    detail = search.fit_all_photos(chosen.stiffness, movable, pieces, seed)
+    gains = dict(zip(trial.names, (scores.values - selected.scores.values).tolist(), strict=True))
+    detail = search.fit_all_photos(selected.stiffness, movable, pieces, seed)
     displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.accepted else {}
     displacements = {name: displacement for name, displacement in displacements.items() if name in movable}
     factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.accepted else {}
-    return SurfaceEstimate(initial, turned.evidence, painted.evidence, chosen.stiffness, gains, displacements, factors)
+    return SurfaceEstimate(
+        initial, turned.evidence, painted.evidence, selected.stiffness, gains, displacements, factors
+    )
 
 
 def fit_trial(
@@ -466,5 +468,5 @@ class ProgressSections(msgspec.Struct, frozen=True):
             activity: Activity.
         """
         self.report(begin, activity)
-        done = count(1)
-        return lambda *_: self.report(begin + (end - begin) * min(next(done) / number, 1.0), activity)
+        completed = count(1)
+        return lambda *_: self.report(begin + (end - begin) * min(next(completed) / number, 1.0), activity)

@@ -142,7 +142,7 @@ class Posterior:
         by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
         # S and s_k, from logarithms to reflectances
         precision, scores = information(self.systems(with_scores=True), len(by_log))
-        scores = [of_light * by_log for of_light in scores]
+        scores = [light_scores * by_log for light_scores in scores]
         variance = largest_variance(precision * np.outer(by_log, by_log), scores, materials, self.problem)
         deviation = residual_deviation(self.problem, self.fit.point)
         variance += ((deviation * MODEL_ERROR * values) ** 2).reshape(-1)

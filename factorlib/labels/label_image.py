@@ -107,10 +107,10 @@ def read_objects(
                 cure="paint it, or leave the key out",
             )
         if objects[inside].any():
-            other = int(objects[inside & (objects > 0)][0]) - 1
-            count = int((objects[inside] == other + 1).sum())
+            overlapped = int(objects[inside & (objects > 0)][0]) - 1
+            count = int((objects[inside] == overlapped + 1).sum())
             raise InputError(
-                f"objects {masks[other][0]!r} and {name!r} share {count} pixels",
+                f"objects {masks[overlapped][0]!r} and {name!r} share {count} pixels",
                 file=file(path),
                 key=mask_key,
                 cure="a pixel shows one object: erase it from the one behind",
@@ -144,8 +144,8 @@ def check_materials(
         InputError: If both faults occur.
     """
     groups = [([k], objects == k + 1) for k in range(len(object_materials)) if (objects == k + 1).any()]
-    alone = [k for k in range(len(object_materials)) if not (objects == k + 1).any()]
-    for members, region in [*groups, (alone, objects == 0)] if alone else groups:
+    unmasked = [k for k in range(len(object_materials)) if not (objects == k + 1).any()]
+    for members, region in [*groups, (unmasked, objects == 0)] if unmasked else groups:
         counts = np.bincount(labels.label[region], minlength=len(materials) + 1)[1:]
         expected = set().union(*(object_materials[k][1] for k in members))
         unexpected = [
@@ -196,10 +196,10 @@ def _merged(
     left_out = label > 0
     for number, material in ((k, name) for k, name in enumerate(materials, 1) if name in inside):
         path, key = sources[material]
-        for other in np.unique(label[inside[material] & (label > 0)]).tolist():
-            shared = inside[material] & (label == other)
-            other_path = sources[materials[other - 1]][0]
-            fault = f"materials {materials[other - 1]!r} and {material!r} share {int(shared.sum())} pixels"
+        for claimed in np.unique(label[inside[material] & (label > 0)]).tolist():
+            shared = inside[material] & (label == claimed)
+            other_path = sources[materials[claimed - 1]][0]
+            fault = f"materials {materials[claimed - 1]!r} and {material!r} share {int(shared.sum())} pixels"
             fault += f" with {other_path.name}" if other_path != path else ""
             square = (edge + 1, edge + 1)
             if min(shared.shape) > edge and sliding_window_view(shared, square).all((2, 3)).any():

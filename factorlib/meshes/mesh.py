@@ -147,9 +147,9 @@ def find_flipped_faces(
     b = second // 3
     has_border = bool((counts == 1).any())
     # graph of orientations: node f is face f unchanged, node f + count is face f flipped
-    other = np.where(ends[first, 0] != ends[second, 0], 0, count)  # they agree if they run in opposite directions
+    offset = np.where(ends[first, 0] != ends[second, 0], 0, count)  # they agree if they run in opposite directions
     rows = np.r_[a, a + count]
-    columns = np.r_[b + other, b + count - other]
+    columns = np.r_[b + offset, b + count - offset]
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
     _, part = connected_components(graph, directed=False)
     unflipped = part[:count]

@@ -176,16 +176,16 @@ def part_labels(
             )
     labels = []
     for part_names in names:
-        chosen = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})
+        candidates = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})
         title = one_line(" / ".join(part_names)) or "(unnamed)"
-        if len(chosen) > 1:
-            fault = f"part {title} gets several materials: {', '.join(sorted(filter(None, chosen)))}"
+        if len(candidates) > 1:
+            fault = f"part {title} gets several materials: {', '.join(sorted(filter(None, candidates)))}"
             raise InputError(fault, file=file, cure="give a material to one of its names only")
-        if None in chosen:
+        if None in candidates:
             example = f"add it to `parts`, e.g. {one_line(part_names[0])}: {materials[0]}" if part_names else None
             cure = example or "name the part in a mesh editor"
             raise InputError(f"part {title} has no material", file=file, key=title, cure=cure)
-        labels.append(list(materials).index(*chosen) + 1)
+        labels.append(list(materials).index(*candidates) + 1)
     return np.array(labels, dtype=np.int16)
 
 

@@ -49,12 +49,12 @@ def subdivide(mesh: Mesh, longest: float) -> Mesh:
         labels = [label[~too_long.any(1)]]
         # rotate the corners of each triangle so that its long edges come first, then split it
         for long_edges, pieces in PIECES.items():
-            chosen = count == long_edges
-            first = too_long[chosen].argmax(1) if long_edges == 1 else (too_long[chosen].argmin(1) + 1) % 3
+            selected = count == long_edges
+            first = too_long[selected].argmax(1) if long_edges == 1 else (too_long[selected].argmin(1) + 1) % 3
             turn = (first[:, None] + np.arange(3)) % 3
-            corners = np.hstack([np.take_along_axis(table[chosen], turn, 1) for table in (faces, middle)])
+            corners = np.hstack([np.take_along_axis(table[selected], turn, 1) for table in (faces, middle)])
             parts.append(corners[:, pieces].reshape(-1, 3))
-            labels.append(np.repeat(label[chosen], len(pieces)))
+            labels.append(np.repeat(label[selected], len(pieces)))
         faces = np.vstack(parts)
         label = np.concatenate(labels)
 
@@ -145,12 +145,12 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         """
         slopes = self.gradients()
         areas = self.areas
-        wanted = turn[self.faces].mean(1)
+        target = turn[self.faces].mean(1)
         weight = areas * np.maximum(node_weight[self.faces].min(1), UNSEEN)
         # normal equations Σ_a G_aᵀ W G_a d = −Σ_a G_aᵀ W t_a, with a small multiple of the identity
         system = sum(slope.T @ diags_array(weight) @ slope for slope in slopes)
         system = system + LEVEL * areas.mean() * eye_array(self.nodes)
-        right = -sum(slope.T @ (weight * wanted[:, a]) for a, slope in enumerate(slopes))
+        right = -sum(slope.T @ (weight * target[:, a]) for a, slope in enumerate(slopes))
         return spsolve(system.tocsc(), right)
 
     def displace(self, displacement: Float[np.ndarray, " v"]) -> Mesh:

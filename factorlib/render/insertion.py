@@ -225,7 +225,7 @@ def insert_object(
     report(2)
     # weight that falls smoothly from 1 near the spot, and above the horizon, to 0 at the rim of the disc
     fade = smooth_step((1 - np.where(np.isinf(insertion.distance), 0, insertion.distance)) / (1 - FADE))[..., None]
-    beside = (1 - coverage)[..., None]
+    background = (1 - coverage)[..., None]
     disc = insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))
     rendering = partial(insertion.radiance, samples=samples, seed=seed)
     without, with_object, shadow = _lighting(
@@ -233,12 +233,14 @@ def insert_object(
     )
     report(3)
     # (2)
-    composite = beside * shadow * photo + np.maximum(with_object - beside * shadow * without, 0) * (beside < 1)
+    composite = background * shadow * photo + np.maximum(with_object - background * shadow * without, 0) * (
+        background < 1
+    )
     # change of the ground's specular part: the object's reflection in it
     if insertion.ground.polish is not None:
         polished = insertion.disc(insertion.ground.polish)
         mirrored = rendering(polished | new) - rendering(polished)
-        composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * fade, 0)
+        composite = np.maximum(composite + mirrored * shows_ground[..., None] * background * fade, 0)
     report(STEPS)
     return InsertionResult(composite, coverage, shadow, np.asarray(diffuse), without)
 
@@ -261,9 +263,9 @@ def _lighting(
     (without, guides_without), (with_object, guides_with) = (np.split(each, [3], axis=-1) for each in renderings)
     with np.errstate(divide="ignore", invalid="ignore"):
         shadow = np.where(without > 0, with_object / without, 1.0)
-    beside = coverage == 0
-    if beside.any():
-        row, column = distance_transform_edt(~beside, return_distances=False, return_indices=True)
+    uncovered = coverage == 0
+    if uncovered.any():
+        row, column = distance_transform_edt(~uncovered, return_distances=False, return_indices=True)
         shadow = shadow[row, column]
     shadow = 1 + (shadow - 1) * fade
     if guides_with.size:  # not the photo, nor pixels whose paths miss the object
@@ -324,8 +326,8 @@ def _coverage(insertion: InsertionScene, samples: int) -> Float[np.ndarray, "h w
         part = submesh(new.mesh, label)
         sides = [part]
         if new.mesh.open:
-            behind = part.vertices - HAIR * new.mesh.radius * part.normals
-            sides.append(Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True))
+            inner = part.vertices - HAIR * new.mesh.radius * part.normals
+            sides.append(Mesh(inner, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True))
         for number, side in enumerate(sides):
             entries[f"{new.name}_{label}_{number}"] = shape(side, surface, new.world_from_object, emitter)
     coverage = np.clip(render_scene(entries, insertion.sensor, samples, 1, 1)[..., 0], 0, 1)
@@ -352,5 +354,5 @@ def shadow_match(photo: Picture, lit: Picture, constant: Picture, mask: Bool[np.
     logs = [np.log(luminance[mask]) for luminance in luminances]
     if mask.sum() < FEWEST or min(map(np.ptp, logs)) == 0:
         return ShadowMatch(None, None, int(mask.sum()))
-    recovered, shape = (float(np.corrcoef(logs[0], other)[0, 1]) for other in logs[1:])
+    recovered, shape = (float(np.corrcoef(logs[0], row)[0, 1]) for row in logs[1:])
     return ShadowMatch(recovered, shape, int(mask.sum()))

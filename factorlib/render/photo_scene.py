@@ -114,11 +114,11 @@ def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, sh
         share: the sun's share of the energy, in [0, 1]
     """
     # `factor` scales the rest of the light; the sun takes the energy that is left
-    rest = light.take(~light.suns)
-    factor = np.divide((1 - share) * light.energy, rest.energy, out=np.zeros(3), where=rest.energy > 0)
-    sharpness = np.append(rest.sharpness, 4 / np.radians(diameter_deg / 2) ** 2)
-    weight = (light.energy - factor * rest.energy) / lobe_energy(sharpness[-1])
-    return Lobes(np.vstack([rest.axis, axis]), sharpness, np.vstack([factor * rest.weight, weight]))
+    sky = light.take(~light.suns)
+    factor = np.divide((1 - share) * light.energy, sky.energy, out=np.zeros(3), where=sky.energy > 0)
+    sharpness = np.append(sky.sharpness, 4 / np.radians(diameter_deg / 2) ** 2)
+    weight = (light.energy - factor * sky.energy) / lobe_energy(sharpness[-1])
+    return Lobes(np.vstack([sky.axis, axis]), sharpness, np.vstack([factor * sky.weight, weight]))
 
 
 def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
@@ -161,7 +161,7 @@ def traced_photo(
     samples: int,
     world_from_camera: Float[np.ndarray, "4 4"] | None = None,
     with_light: bool = False,
-    beside: Mapping[str, Any] = {},
+    extra_entries: Mapping[str, Any] = {},
     max_depth: int | None = None,
 ) -> Float[np.ndarray, "h w 4"]:
     """Render the scene by path tracing.
@@ -171,14 +171,14 @@ def traced_photo(
         samples: samples per pixel
         world_from_camera: pose of the camera, in OpenCV's axes; by default the photo's own
         with_light: show the light behind the objects
-        beside: further entries of the scene, for Mitsuba
+        extra_entries: further entries of the scene, for Mitsuba
         max_depth: replaces the scene's own
 
     Returns:
         Linear radiance times coverage, and coverage: the share of a pixel that objects, or the visible light, fill.
     """
     pose = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
-    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **beside}
+    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **extra_entries}
     view = sensor(scene.camera, pose, near_clip=scene.near_clip, alpha=True)
     depth = scene.max_depth if max_depth is None else max_depth
     channels = Channels(hide_emitters=not with_light, guides=scene.denoise)

@@ -65,9 +65,9 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
         return write_grid(recipe, results, out, progress)
     photos = recipe.photos or results.photos
     refusals = []
-    for done, photo in enumerate(photos):
+    for index, photo in enumerate(photos):
         try:
-            report = partial(_report_photo, progress, done, len(photos), photo)
+            report = partial(_report_photo, progress, index, len(photos), photo)
             facts = WRITERS[type(recipe)](recipe, results, photo, out, report) or {}
             captions = [facts.pop("caption")] if facts else []
             if recipe.sun is not None:

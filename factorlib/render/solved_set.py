@@ -155,17 +155,17 @@ class SolvedSet:
 
     def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the ground given with the photo, or the plane that the neighbour rests on."""
-        given = self.grounds[photo].ground
-        if given is None:
+        ground_entry = self.grounds[photo].ground
+        if ground_entry is None:
             # up vectors of the cameras of all objects of the mesh, in its frame
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
             poses = [self.poses[each].objects[obj.name] for each, obj in self._objects_of(mesh)]
             trusted = [pose for pose in poses if not pose.left_out] or poses
             uprights = np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
             return GroundSurface(resting_plane(neighbour, uprights))
-        normal = YUP_FROM_CAMERA @ np.array(given.normal)
+        normal = YUP_FROM_CAMERA @ np.array(ground_entry.normal)
         return GroundSurface(
-            Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse
+            Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(ground_entry.point)), ground_entry.diffuse
         )
 
     def mesh(

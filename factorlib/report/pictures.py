@@ -138,7 +138,7 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
     """
     masks = run.channels("masks", name)
     geometry = run.channels("align", name)
-    again = run.rgb("render", f"resynthesis/{name}")
+    resynthesis = run.rgb("render", f"resynthesis/{name}")
     exposure = errors.exposure if errors else 1.0
     box = bounding_box(np.rint(masks["label"]) > 0)
     masks, geometry = ({k: v[box] for k, v in channels.items()} for channels in (masks, geometry))
@@ -146,11 +146,11 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
     display = picture(photo, exposure).astype(np.float32) / 255
     in_mask = masks["label"] > 0.5
     panels = {"photo": display, "materials": _labels(masks, geometry, photo * exposure, list(tags.values()))}
-    if again is not None:
-        again = picture(np.nan_to_num(again[box], posinf=0, neginf=0), exposure).astype(np.float32) / 255
+    if resynthesis is not None:
+        resynthesis = picture(np.nan_to_num(resynthesis[box], posinf=0, neginf=0), exposure).astype(np.float32) / 255
         explained = in_mask & (np.rint(masks["label"]) == np.rint(geometry["label"]))
-        panels["re-synthesis"] = np.concatenate([again, explained[..., None]], axis=-1)
-        difference = 0.5 + AMPLIFICATION * (again - display)  # grey where equal
+        panels["re-synthesis"] = np.concatenate([resynthesis, explained[..., None]], axis=-1)
+        difference = 0.5 + AMPLIFICATION * (resynthesis - display)  # grey where equal
         clipped = np.any([masks[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
         difference[~agreeing_pixels(masks, geometry) | clipped] = UNCOUNTED
         panels["difference"] = np.concatenate([np.clip(difference, 0, 1), in_mask[..., None]], axis=-1)
@@ -186,16 +186,16 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
     pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
     camera = scene.camera.window(left, top, pixel, ceil(width / pixel), ceil(height / pixel))
     scene = msgspec.structs.replace(scene, camera=camera)
-    again = TracedPicture(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
+    rerendered = TracedPicture(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
     others = [p for p in run.set.photos if run.illumination_of(p) in lit - {row.illumination}]
-    other = others[0] if others else None
-    light = results.light(other) if other else rotate_light(scene.light, 180.0)
+    other_light = others[0] if others else None
+    light = results.light(other_light) if other_light else rotate_light(scene.light, 180.0)
     relit = TracedPicture(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
     exposure = row.errors.exposure if row.errors else 1.0
-    caption = f"in the light of {other}" if other else "in its own light, turned half around"
+    caption = f"in the light of {other_light}" if other_light else "in its own light, turned half around"
     return [
         photo,
-        ("re-synthesis", data_uri(again.rgba(exposure)), "path-traced from what was recovered"),
+        ("re-synthesis", data_uri(rerendered.rgba(exposure)), "path-traced from what was recovered"),
         ("relit", data_uri(relit.with_exposure().rgba()), caption),
     ]
 

@@ -71,8 +71,8 @@ def viewer_data(
         turn = YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)) @ YUP_FROM_CAMERA.T
         photo = {"name": name, "light": lights[name].illumination, "rotation": turn.ravel().tolist()}
         photos.append(photo | {"gain": run.exposures.get(name, (1.0,) * 3), "exposure": exposure[name]})
-    drawn = {name: _light(each) for name, each in lobes.items()}
-    return {**_objects(run, objects), "materials": materials, "lights": drawn, "photos": photos}
+    lit_materials = {name: _light(each) for name, each in lobes.items()}
+    return {**_objects(run, objects), "materials": materials, "lights": lit_materials, "photos": photos}
 
 
 def _light(lobes: Lobes) -> dict[str, Any]:
@@ -233,9 +233,9 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     for vertex, k, face, turned in occluders.hidden_from(points, sides.normals, directions):
         hit_vertex = mesh.faces[face, 0].astype(np.int64)
         # a hit on the back of a triangle is on the mesh's other side, or inside a closed mesh, which is black
-        behind = np.sum(occluders.hit_normals(face, turned) * mesh.normals[hit_vertex], 1) < 0
+        is_back = np.sum(occluders.hit_normals(face, turned) * mesh.normals[hit_vertex], 1) < 0
         hit_vertex = np.where(
-            (face < 0) | behind & (not mesh.open), len(outward), hit_vertex + np.where(behind, single, 0)
+            (face < 0) | is_back & (not mesh.open), len(outward), hit_vertex + np.where(is_back, single, 0)
         )
         pairs.append(np.stack([vertex, k, hit_vertex])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
     vertex, k, hit_vertex = np.concatenate(pairs, axis=1)

@@ -223,7 +223,7 @@ def attach_errors(
     reflectance: Reflectance,
     stderr: StandardErrors,
     kind: Kind | UnsetType = UNSET,
-    given: list[str] | UnsetType = UNSET,
+    given_fields: list[str] | UnsetType = UNSET,
 ) -> SolvedMaterial:
     """Combine a reflectance with its standard errors.
 
@@ -231,10 +231,10 @@ def attach_errors(
         reflectance: the reflectance
         stderr: its standard errors
         kind: class of the material
-        given: parts of the reflectance that were known beforehand
+        given_fields: parts of the reflectance that were known beforehand
     """
     rows = reflectance.diffuse, reflectance.specular, reflectance.roughness
-    return SolvedMaterial(*rows, reflectance.roughness**2, stderr, kind, given)
+    return SolvedMaterial(*rows, reflectance.roughness**2, stderr, kind, given_fields)
 
 
 def read_uncertainty(path: str | Path) -> Uncertainty:

@@ -140,9 +140,11 @@ class Display:
         """Set the bar of a stage."""
         total, left = self.stages.get(stage, (1, 1))
         running = {step: state for step, state in self._running.items() if step.stage == stage}
-        done = total - left + sum(share for share, _ in running.values())
+        completed = total - left + sum(share for share, _ in running.values())
         words = "; ".join(f"{step.item} {text}".strip() for step, (_, text) in running.items())[:80]
-        self._bars.update(self._rows[stage], completed=done, total=total, count=f"{total - left}/{total}", words=words)
+        self._bars.update(
+            self._rows[stage], completed=completed, total=total, count=f"{total - left}/{total}", words=words
+        )
 
     def close(self) -> None:
         """Release the terminal."""

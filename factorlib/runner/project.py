@@ -210,8 +210,8 @@ def check_name(name: str, kind: str, *, file: Any = None, key: str | None = None
     """
     usable = name.isprintable() and "/" not in name and len(name.encode()) <= LONGEST
     if not usable or name in ("", ".", "..", *reserved):
-        taken = f"; the names {', '.join(reserved)} are reserved" if reserved else ""
-        cure = f"rename it: printable characters, at most {LONGEST} bytes, no slash{taken}"
+        reserved_names = f"; the names {', '.join(reserved)} are reserved" if reserved else ""
+        cure = f"rename it: printable characters, at most {LONGEST} bytes, no slash{reserved_names}"
         raise InputError(f"{kind} cannot be called {name!r}", file=file, key=key, cure=cure)
 
 
@@ -326,11 +326,11 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def for_data(self, is_empty: Callable[[str], bool]) -> Pipeline:
         """Return the pipeline without the stages whose slice (`Stage.when`) is empty in a dataset."""
-        gone = {name for name, stage in self.stages.items() if stage.when and is_empty(stage.when)}
-        rest = {name: stage for name, stage in self.stages.items() if name not in gone}
-        for name, stage in rest.items():
-            rest[name] = msgspec.structs.replace(stage, inputs=[each for each in stage.inputs if each not in gone])
-        return msgspec.structs.replace(self, stages=rest)
+        dropped = {name for name, stage in self.stages.items() if stage.when and is_empty(stage.when)}
+        stages = {name: stage for name, stage in self.stages.items() if name not in dropped}
+        for name, stage in stages.items():
+            stages[name] = msgspec.structs.replace(stage, inputs=[each for each in stage.inputs if each not in dropped])
+        return msgspec.structs.replace(self, stages=stages)
 
     def needed(self, targets: list[str] | None) -> list[str]:
         """Return the targets and all stages above them, in order; None stands for all stages that are not optional."""

@@ -104,7 +104,7 @@ def find_results(project: Project, dataset: str | None) -> list[ResultsFolder]:
     folder = project.find_dataset(dataset)
     results = results_of(project, folder or Path(os.path.abspath(dataset)))
     if folder is None and not results.mark.is_file():
-        known = [other.folder.name for other in all_results(project)]
+        known = [folder_results.folder.name for folder_results in all_results(project)]
         cure = did_you_mean(dataset, known) if known else "build/ holds no results of any dataset"
         raise InputError(f"there is no dataset {dataset!r}, and no results of one", key="DATASET", cure=cure)
     return [results] if results.mark.is_file() else []
@@ -165,7 +165,7 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
         cure = f"leave {SHARED} out for the store of this checkout; in the shared one delete trees and keys by age"
         raise InputError(fault, file=store.root, cure=cure)
     with no_runs(store):
-        keys, trees, rest = _unused(project, store)
+        keys, trees, leftovers = _unused(project, store)
         stages = {entry.output: entry.record["stage"] for path in keys if (entry := store.entry(path.stem))}
         groups: dict[str, list[Path]] = {}
         for path in trees:
@@ -173,12 +173,12 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
         for stage, paths in groups.items():
             size = sum(file.stat().st_size for path in paths for file in path.rglob("*") if file.is_file())
             dates = sorted(time.strftime("%Y-%m-%d", time.localtime(path.stat().st_mtime)) for path in paths)
-            made = " to ".join(dict.fromkeys((dates[0], dates[-1])))
-            print(f"{stage:<10} {_results(len(paths)):>12} {size / 1e6:>9.1f} MB   of {made}")
+            period = " to ".join(dict.fromkeys((dates[0], dates[-1])))
+            print(f"{stage:<10} {_results(len(paths)):>12} {size / 1e6:>9.1f} MB   of {period}")
         if groups and not confirm():
             print("nothing was deleted")
             return 0
-        for path in keys + trees + rest:
+        for path in keys + trees + leftovers:
             if path.is_dir() and not path.is_symlink():  # renamed first: a part would count as a damaged result
                 aside = store.tmp / f"run-gc-{path.name}"
                 os.rename(path, aside)
@@ -199,10 +199,14 @@ def _unused(project: Project, store: Store) -> tuple[list[Path], list[Path], lis
     keys = _needed(store, {key for table in current for key in table.values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
     unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
-    rest = [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
+    leftovers = [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
     linked = {os.path.realpath(link) for link in project.build.glob("*/*") if link.is_symlink()}
-    rest += [view for view in store.views.glob("*") if os.path.realpath(view) not in linked]
-    return unused, [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees], rest
+    leftovers += [view for view in store.views.glob("*") if os.path.realpath(view) not in linked]
+    return (
+        unused,
+        [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees],
+        leftovers,
+    )
 
 
 def _needed(store: Store, current: set[str]) -> set[str]:

@@ -115,19 +115,19 @@ class Run:
         if step in self.running or step in self.failed or step in self.completed or not self.workers.free(cores):
             return
         try:
-            taken = lock(self.store.locks / f"{planned.key}.lock")
+            step_lock = lock(self.store.locks / f"{planned.key}.lock")
         except TimeoutError:
             self.waiting.add(planned.key)
             return self.display.report_once(f"{step}: waiting: another run is making it")
         self.store.forget([planned.key])
         if self.store.get(planned.key) is not None and "forced" not in planned.reasons:
-            taken.release()  # Another run has made it meanwhile.
+            step_lock.release()  # Another run has made it meanwhile.
             self.stale = True
         else:
             self.display.start(step)
             task = self._task(planned, code)
             future = self.workers.submit(cores, code.threads, run_step, task)
-            self.running[step] = RunningStep(step, task, taken, future)
+            self.running[step] = RunningStep(step, task, step_lock, future)
 
     def _task(self, planned: PlannedStep, code: StageCode) -> Task:
         step = planned.step
@@ -168,15 +168,15 @@ class Run:
     def _wait(self) -> None:
         """Wait for outcomes or events; the plan is stale if there are outcomes, or another run makes a step."""
         futures = {work.future: step for step, work in self.running.items()}
-        done = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED).done if futures else set()
+        finished = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED).done if futures else set()
         if not futures:
             time.sleep(POLL)
         for work in self.running.values():
             self._read_events(work)
-        for future in done:
+        for future in finished:
             self._collect(self.running.pop(futures[future]))
         self.store.forget(self.waiting)
-        self.stale |= bool(done or self.waiting)
+        self.stale |= bool(finished or self.waiting)
 
     def _read_events(self, work: RunningStep) -> None:
         """Display the new events of a worker."""

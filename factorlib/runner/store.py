@@ -237,9 +237,9 @@ def lock(path: Path, wait: bool = False) -> BaseFileLock:
     from filelock import FileLock  # A run with nothing to do does not load it.
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    taken = FileLock(path, mode=0o664, thread_local=False)
-    taken.acquire(timeout=-1 if wait else 0)
-    return taken
+    file_lock = FileLock(path, mode=0o664, thread_local=False)
+    file_lock.acquire(timeout=-1 if wait else 0)
+    return file_lock
 
 
 def is_locked(path: Path) -> bool:
@@ -274,9 +274,9 @@ def finish_tree(folder: Path) -> dict[str, str]:
         InputError: There is a link or a pipe.
     """
     stamps = sorted(stamps_of(folder).items())
-    if other := next((name for name, stamp in stamps if stamp == NO_FILE), None):
-        fault = f"a stage wrote {other!r}, which is a link or a device"
-        raise InputError(fault, file=folder / other, cure="write a file")
+    if special := next((name for name, stamp in stamps if stamp == NO_FILE), None):
+        fault = f"a stage wrote {special!r}, which is a link or a device"
+        raise InputError(fault, file=folder / special, cure="write a file")
     for name, _ in stamps:
         (folder / name).chmod(0o444)
     sync_tree(folder)

@@ -106,9 +106,9 @@ def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
         if result.held_up:
             print(f"not run because of that: {', '.join(dict.fromkeys(step.stage for step in result.held_up))}")
         return 1
-    done = len(result.completed)
+    completed = len(result.completed)
     seconds = time.perf_counter() - started
-    print(f"{name}: {count(result.completed)} run, {len(state.records) - done} current, {seconds:.1f} s")
+    print(f"{name}: {count(result.completed)} run, {len(state.records) - completed} current, {seconds:.1f} s")
     return 0
 
 
@@ -253,8 +253,8 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
-    rest = "; still missing, or yours to decide:" if missing else ""
-    print(f"{project.short_path(folder)}/dataset.yaml is written{rest}")
+    ending = "; still missing, or yours to decide:" if missing else ""
+    print(f"{project.short_path(folder)}/dataset.yaml is written{ending}")
     for line in missing:
         print(f"  {line}")
     try:

@@ -113,7 +113,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
             outlines[0].photo,
         )
         best = max(starts[0][1], key=lambda body: abs(body.tilt_deg))
-        return msgspec.structs.replace(mesh_profile(best.profile).of_size(1.0), overlap=best.overlap)
+        return msgspec.structs.replace(mesh_profile(best.profile).with_size(1.0), overlap=best.overlap)
     poses = _choose_tilt(starts, outlines[:JUDGES], report)
     profile = poses[0].profile
     poses += [fit_pose(outline, profile) for outline in outlines[JUDGES:]]
@@ -122,7 +122,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
         profile = carve(outlines, poses, (profile[0, 0], profile[-1, 0]))
         poses = [fit_pose(outline, profile, pose) for outline, pose in zip(outlines, poses, strict=True)]
     mean_overlap = float(np.mean([pose.overlap for pose in poses]))
-    return msgspec.structs.replace(mesh_profile(profile).of_size(1.0), overlap=mean_overlap)
+    return msgspec.structs.replace(mesh_profile(profile).with_size(1.0), overlap=mean_overlap)
 
 
 def _fill_holes(outline: Outline) -> Outline:
@@ -155,10 +155,10 @@ def _choose_tilt(
     A warning is logged if a wide range of tilts explains the outlines alike. `starts` holds outlines and bodies of
     different tilts that explain each.
     """
-    bodies = [(outline, body) for outline, of_outline in starts for body in of_outline]
+    bodies = [(outline, body) for outline, candidates in starts for body in candidates]
     trials = []
-    for done, (outline, body) in enumerate(bodies):
-        report(0.7 * done / len(bodies))
+    for index, (outline, body) in enumerate(bodies):
+        report(0.7 * index / len(bodies))
         poses = [body if judge is outline else fit_pose(judge, body.profile) for judge in judges]
         trials.append(TiltTrial(outline, body, poses))
     best = max(trials, key=lambda trial: trial.overlap)
@@ -171,18 +171,18 @@ def _choose_tilt(
             poses = [finer if judge is best.outline else fit_pose(judge, finer.profile, start) for judge, start in near]
             trials.append(TiltTrial(best.outline, finer, poses))
     best = max(trials, key=lambda trial: trial.overlap)
-    alike = [
+    similar = [
         trial.body.tilt_deg
         for trial in trials
         if trial.outline is best.outline and trial.overlap >= best.overlap - AS_GOOD
     ]
-    if max(alike) - min(alike) > UNTOLD_DEG:
+    if max(similar) - min(similar) > UNTOLD_DEG:
         log.warning(
             "%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is uncertain: add a "
             "photo from higher up or from lower down",
             best.outline.photo,
-            min(alike),
-            max(alike),
+            min(similar),
+            max(similar),
         )
     return best.poses
 

@@ -91,7 +91,7 @@ class Triangles(msgspec.Struct, frozen=True):
         label = np.ones(len(self.faces), np.int16)
         return Mesh(self.vertices, self.faces.astype(np.int32), np.ones_like(self.vertices), label)
 
-    def of_size(self, size: float) -> "Triangles":
+    def with_size(self, size: float) -> "Triangles":
         """Centre the bounding box at the origin and scale its longest side to `size`."""
         low = self.vertices.min(axis=0)
         high = self.vertices.max(axis=0)

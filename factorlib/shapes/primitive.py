@@ -61,15 +61,15 @@ def primitive(
     targets = [make_target(outline.view, (1,), RESOLUTION) for outline in outlines]
     starts = STARTS.get(kind, ((1, 1, 1),))
     best: tuple[float, Float[np.ndarray, "3"]] = -1.0, np.ones(3)
-    for done, start in enumerate(starts):
-        report(done / len(starts))
+    for index, start in enumerate(starts):
+        report(index / len(starts))
         mesh = unit_shape(kind, np.array(start, float)).as_mesh()
         caster = Caster(mesh)
         states = [estimate_pose(caster, outline.view, SEARCH).state for outline in outlines]
         factors, score = fit_proportions(mesh, targets, states, STEPS, FREE_FACTORS.get(kind, np.zeros((3, 0))))
         if score > best[0]:
             best = score, factors * start
-    return msgspec.structs.replace(unit_shape(kind, best[1]).of_size(1.0), overlap=best[0])
+    return msgspec.structs.replace(unit_shape(kind, best[1]).with_size(1.0), overlap=best[0])
 
 
 def unit_shape(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:

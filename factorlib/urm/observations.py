@@ -82,8 +82,8 @@ class Observations(msgspec.Struct, frozen=True):
     def take(self, rows: np.ndarray) -> Observations:
         """Select the observations of `rows` (indices or a mask), with the same names."""
         columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL, "detail")}
-        taken = {name: values[rows] for name, values in columns.items() if values is not None}
-        return msgspec.structs.replace(self, **taken)
+        selected = {name: values[rows] for name, values in columns.items() if values is not None}
+        return msgspec.structs.replace(self, **selected)
 
 
 # types of the required columns
@@ -206,15 +206,15 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0), "detail": (np.dtype("f4"), 1)}
     # optional columns: parts without them get full visibility, full confidence, and the origin as place
     for name, (dtype, fill) in fills.items():
-        given = [getattr(part, name) for part in parts]
-        shapes = {values.shape[1:] for values in given if values is not None}
+        columns = [getattr(part, name) for part in parts]
+        shapes = {values.shape[1:] for values in columns if values is not None}
         if len(shapes) > 1:
             counts = sorted(count for (count,) in shapes)
             raise InputError(f"reflectance maps whose {name} has {counts} directions", cure=cure)
         for shape in shapes:
             filled = [
                 np.full((len(part), *shape), fill, dtype) if values is None else values
-                for part, values in zip(parts, given)
+                for part, values in zip(parts, columns)
             ]
             fields[name] = np.concatenate(filled)
     fields["exposures"] = tuple(exposures.get(photo) for photo in fields["photos"])

@@ -42,9 +42,9 @@ def main() -> None:
         "diffuse": diffuse_inputs(normal, axis, sharpness),
         "specular": specular_inputs(normal, half, axis, sharpness, roughness),
     }
-    for part, of in inputs.items():
-        problem = pixels_problem(of, sharpness, _flat(getattr(pixels, part)))
-        layers = trained_plainly(problem, SCHEDULES[part], lambda *at, part=part: print(part, *at, flush=True))
+    for part, columns in inputs.items():
+        problem = pixels_problem(columns, sharpness, _flat(getattr(pixels, part)))
+        layers = trained_plainly(problem, SCHEDULES[part], lambda *words, part=part: print(part, *words, flush=True))
         file = SHIPPED / f"paper_{part}.safetensors"
         note = "see factorlib.reflection.paper_network"
         write_layers(file, layers, torch.float16, inputs=note)

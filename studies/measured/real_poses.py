@@ -61,7 +61,7 @@ def without_poses(dataset: Dataset) -> Dataset:
     """Return the dataset without cameras, poses, keypoints and cameras from another program."""
     replace = msgspec.structs.replace
     bare = [[replace(obj, pose=None, keypoints=[]) for obj in photo.objects] for photo in dataset.spec.photos]
-    photos = [replace(p, camera=None, objects=of) for p, of in zip(dataset.spec.photos, bare, strict=True)]
+    photos = [replace(p, camera=None, objects=objects) for p, objects in zip(dataset.spec.photos, bare, strict=True)]
     return replace(dataset, spec=replace(dataset.spec, photos=photos), external={})
 
 

@@ -123,10 +123,10 @@ def score_method(truths: Materials, maps: Maps, prediction: MethodPrediction, pi
     """Score a method by its pictures, and by the materials and lights that it states."""
     score = Score({})
     for kind in KINDS:
-        if some := [picture for picture in pictures if picture.target.kind == kind]:
-            samples = [[getattr(picture, part) for picture in some] for part in ("predicted", "truth", "white")]
+        if group := [picture for picture in pictures if picture.target.kind == kind]:
+            samples = [[getattr(picture, part) for picture in group] for part in ("predicted", "truth", "white")]
             for gauge, factors in gauge_factors(*samples, below_white=True).items():
-                errors = [picture.dssim(factor) for picture, factor in zip(some, factors, strict=True)]
+                errors = [picture.dssim(factor) for picture, factor in zip(group, factors, strict=True)]
                 score |= Score({kind + SUFFIXES[gauge]: float(np.mean(errors))})
     if materials := prediction.materials:  # of a Lambertian method k_d alone
         parts = PARTS if any(any(m.specular) for m in materials.values()) else PARTS[:1]

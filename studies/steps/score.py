@@ -93,7 +93,7 @@ def score_case(
         return score
     tint = float(np.std(np.log(gauge_factor(estimates, truths))))
     colours = {"chromaticity": recovered, "true_chromaticity": {li: maps[li] for li in recovered}}
-    return score | Score({name: chromaticity(of_case) for name, of_case in colours.items()} | {"tint": tint})
+    return score | Score({name: chromaticity(case_colours) for name, case_colours in colours.items()} | {"tint": tint})
 
 
 def stated_errors(table: Iterable[SolvedMaterial]) -> Score:
@@ -141,7 +141,9 @@ def sphere_errors(case: Case, materials: Materials, lights: Maps, truths: Materi
     subsets = {"entries": pairs, "observed": observed, "unobserved": [p for p in pairs if p not in observed]}
     errors = {(n, li): dssim(recovered[li].ball(materials[n]), n, li) for n, li in pairs}
     flat = {(n, li): dssim(true[li].ball(truths[n]).mean(axis=0, keepdims=True), n, li) for n, li in pairs}
-    means = ({key: _mean(each[p] for p in some) for key, some in subsets.items() if some} for each in (errors, flat))
+    means = (
+        {key: _mean(each[p] for p in subset) for key, subset in subsets.items() if subset} for each in (errors, flat)
+    )
     relit = {n: _mean(dssim(true[li].ball(materials[n]), n, li) for li in true) for n in names}
     values = {"new_light": _mean(relit.values())}
     values |= {"first_material": relit[case.names[0]]} if case.names[0] in relit else {}

@@ -343,7 +343,7 @@ def stand(spot: Spot) -> PlacedMesh:
 
 def test_a_ball_in_a_ball_moves_until_they_touch_and_stays_there():
     there, spot = at(sphere(0.5), (0.3, -0.5, -6.2)), Spot(LOW, np.array([0.2, -1.0, -6.0]), 0.6)
-    new, moved, words = free_placement(scene_of(there), stand, spot, asked=True, factor=2)
+    new, moved, words = free_placement(scene_of(there), stand, spot, is_requested=True, factor=2)
     between = np.linalg.norm(new.vertices.mean(axis=0) - there.vertices.mean(axis=0))
     assert 0.795 < between < 0.8 + 1.5 * STEP * 0.6  # of radii .5 and .3
     far = np.linalg.norm(moved.point - spot.point)
@@ -353,13 +353,13 @@ def test_a_ball_in_a_ball_moves_until_they_touch_and_stays_there():
     assert words == (
         f"The new object was moved by {far / 0.6:.1f} of its heights, to `at: [{x:.0f}, {y:.0f}]`, because it would intersect 'there'."
     )
-    again, same, words = free_placement(scene_of(there), stand, moved, asked=True)
+    again, same, words = free_placement(scene_of(there), stand, moved, is_requested=True)
     assert words == "" and same is moved and np.array_equal(again.vertices, new.vertices)
 
 
 def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
     spot = Spot(LOW, np.array([-0.9, -1.0, -6.0]), 1.2)
-    new, there, words = free_placement(scene_of(at(sphere(1.0), (0.9, 0, -6.5))), stand, spot, asked=False)
+    new, there, words = free_placement(scene_of(at(sphere(1.0), (0.9, 0, -6.5))), stand, spot, is_requested=False)
     assert words == "" and there is spot and new.vertices[:, 1].min() == pytest.approx(-1.0)
 
 
@@ -377,7 +377,7 @@ def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked
     spot = Spot(LOW, np.array(point), 0.8)
     error = refusal(words, free_placement, scene_of(other), stand, spot, asked=True)
     assert error.key == "at" and cure in error.cure
-    new, there, said = free_placement(scene_of(other), stand, spot, asked=False)
+    new, there, said = free_placement(scene_of(other), stand, spot, is_requested=False)
     assert words in said
     x, y = (int(v) for v in error.cure.split("[")[1].split("]")[0].split(","))
     named = unproject_spot(scene_of(other), LOW, new, (x, y), 1.0)  # the place that is named is where it is moved to

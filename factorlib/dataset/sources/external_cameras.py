@@ -62,9 +62,9 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
         else:
             hulls = {obj.name for obj in photo.objects if spec.meshes[obj.mesh].hull}
             poses = _poses(photo, image, source, hulls, refuse)
-            given = photo.camera
-            if given is not None and given.focal_px is not None and given.principal_point is not None:
-                camera = ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
+            intrinsics = photo.camera
+            if intrinsics is not None and intrinsics.focal_px is not None and intrinsics.principal_point is not None:
+                camera = ExternalCamera(kind, intrinsics.focal_px, intrinsics.principal_point, None, poses)
             else:
                 focal, centre = pinhole(image.camera, image.key, refuse)
                 camera = ExternalCamera(kind, focal, None if image.centred else centre, image.size, poses)
@@ -93,12 +93,12 @@ def match_images(spec: DatasetFile, kind: str, images: list[SourceImage], refuse
     """
     assert spec.cameras is not None
     by_name = {image.name: image for image in images}
-    alike: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
+    by_pattern: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
     for image in images:
         path = PurePosixPath(str(image.name).replace("\\", "/"))
         stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
         for pattern in (("id", image.name), ("path", *path.parts), ("file", path.name), ("stem", stem)):
-            alike.setdefault(pattern, []).append(image)
+            by_pattern.setdefault(pattern, []).append(image)
     result = {}
     for photo in spec.photos:
         key = f"cameras.images.{photo.name}"
@@ -109,7 +109,7 @@ def match_images(spec: DatasetFile, kind: str, images: list[SourceImage], refuse
             )
             result[photo.name] = by_name[name]
             continue
-        matches = ([image for pattern in each for image in alike.get(pattern, [])] for each in _patterns(photo))
+        matches = ([image for pattern in each for image in by_pattern.get(pattern, [])] for each in _patterns(photo))
         candidates = next(filter(None, matches), [])
         if len(candidates) > 1:
             names = ", ".join(repr(image.name) for image in candidates[:3])
