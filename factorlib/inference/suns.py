@@ -82,8 +82,8 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
             decision = compare_illuminations(with_wide_lobe, with_suns[k], CLEARLY_AGAINST)
             evidence[k] = evidence[k] if decision.accepted else decision
     fits = [trial if decision.accepted else fit for decision in evidence]
-    lights = [selected.point.lights[k] for k, selected in enumerate(fits)]
-    hyperparameters = [selected.hyperparameters[k] for k, selected in enumerate(fits)]
+    lights = [light_fit.point.lights[k] for k, light_fit in enumerate(fits)]
+    hyperparameters = [light_fit.hyperparameters[k] for k, light_fit in enumerate(fits)]
     return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 

@@ -233,9 +233,8 @@ def insert_object(
     )
     report(3)
     # (2)
-    composite = background * shadow * photo + np.maximum(with_object - background * shadow * without, 0) * (
-        background < 1
-    )
+    gain = np.maximum(with_object - background * shadow * without, 0) * (background < 1)
+    composite = background * shadow * photo + gain
     # change of the ground's specular part: the object's reflection in it
     if insertion.ground.polish is not None:
         polished = insertion.disc(insertion.ground.polish)

@@ -71,8 +71,8 @@ def viewer_data(
         turn = YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)) @ YUP_FROM_CAMERA.T
         photo = {"name": name, "light": lights[name].illumination, "rotation": turn.ravel().tolist()}
         photos.append(photo | {"gain": run.exposures.get(name, (1.0,) * 3), "exposure": exposure[name]})
-    lit_materials = {name: _light(each) for name, each in lobes.items()}
-    return {**_objects(run, objects), "materials": materials, "lights": lit_materials, "photos": photos}
+    light_data = {name: _light(each) for name, each in lobes.items()}
+    return {**_objects(run, objects), "materials": materials, "lights": light_data, "photos": photos}
 
 
 def _light(lobes: Lobes) -> dict[str, Any]:

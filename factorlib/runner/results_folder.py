@@ -202,11 +202,8 @@ def _unused(project: Project, store: Store) -> tuple[list[Path], list[Path], lis
     leftovers = [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
     linked = {os.path.realpath(link) for link in project.build.glob("*/*") if link.is_symlink()}
     leftovers += [view for view in store.views.glob("*") if os.path.realpath(view) not in linked]
-    return (
-        unused,
-        [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees],
-        leftovers,
-    )
+    orphans = [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees]
+    return unused, orphans, leftovers
 
 
 def _needed(store: Store, current: set[str]) -> set[str]:
