@@ -307,13 +307,13 @@ def _changes(store: Store, first: dict[str, str], second: dict[str, str]) -> lis
 
 def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int:
     """Pack a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
-    from factorlib.pack import write_pack as write_zip
+    from factorlib.pack import write_pack
 
     if not (folders := find_results(project, dataset)):
         raise InputError(f"{dataset} has no results", key="DATASET", cure=project.command("all", dataset))
     folder = folders[0].folder
     out = out or Path(f"{folder.name}.zip")
-    files = write_zip(folder, out, replace)
+    files = write_pack(folder, out, replace)
     print(f"{folder.name}: {files} files, {out.stat().st_size / 1e6:.1f} MB\n  {out}")
     return 0
 
