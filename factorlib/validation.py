@@ -20,7 +20,7 @@ from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
-from factorlib.labels.label_image import check_materials, read_labels, read_objects
+from factorlib.labels.label_image import check_materials, read_labels, read_object_indices
 from factorlib.meshes.read_mesh import part_labels, read_mesh, read_parts
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.recipe.kinds import is_light_file
@@ -135,7 +135,9 @@ class Validation:
         check_pixels(size, most_megapixels, path, f"{key}.image")
         check_values(path, most_megapixels, f"{key}.image")
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
-        objects = read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
+        objects = read_object_indices(
+            [(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects"
+        )
         object_materials = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
         masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
         check_materials(labels, objects, object_materials, self.spec.materials, self.file(masks), f"{key}.objects")

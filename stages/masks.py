@@ -20,7 +20,7 @@ from factorlib.images.photo import Photo, box_majority, check_bright, decode_pho
 from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
-from factorlib.labels.label_image import Labels, read_labels, read_objects
+from factorlib.labels.label_image import Labels, read_labels, read_object_indices
 from factorlib.results.photos import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 
@@ -66,7 +66,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
     labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, key)
     object_masks = [(o.name, o.mask) for o in facts.objects]
-    objects = read_objects(object_masks, inputs.file, opened.size, f"{entry}.objects")
+    objects = read_object_indices(object_masks, inputs.file, opened.size, f"{entry}.objects")
     # smallest integer factor at which materials and frame fit their limits
     factor = max(
         least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame)

@@ -27,7 +27,7 @@ from factorlib.results.shape_table import FILE, ShapeEntry, ShapesTable
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.motion import PhotoForMotion, RegisteredCamera, cameras_by_motion
-from factorlib.shapes.outline import Outline, Triangles, write_obj
+from factorlib.shapes.outline import Outline, Triangles, write_triangles
 from factorlib.shapes.primitive import primitive
 from factorlib.stage import Inputs, Progress
 
@@ -61,7 +61,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             shape = estimate_shape(entry, outlines, params, _share(first_share + part * index, part, name, progress))
         except InputError as error:
             raise InputError(error.fault, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
-        write_obj(out / "meshes" / f"{name}.obj", shape, shape_parts(entry))
+        write_triangles(out / "meshes" / f"{name}.obj", shape, shape_parts(entry))
         extent = tuple(np.ptp(shape.vertices, axis=0).tolist())
         used = sorted({outline.photo for outline in outlines})
         shapes[name] = ShapeEntry(shape_kind(entry), extent, len(shape.faces), used, shape.overlap)

@@ -48,7 +48,7 @@ def body(name: str, triangles: int | None = None) -> Caster:
     if triangles is not None:
         total = sum(len(faces) for _, faces, _ in parts)
         parts = [bodies.decimate(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
-    return Caster(bodies.join_parts(parts, name))
+    return Caster(bodies.mesh_from_parts(parts, name))
 
 
 def observe_objects(

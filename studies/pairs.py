@@ -210,11 +210,11 @@ def score(
         body: Pixels of the object.
     """
     recovered, true, before = (cielab(image) for image in (*pair, photo))
-    changed = (difference(recovered, before) > CHANGED) | (difference(true, before) > CHANGED)
+    changed = (paired_difference(recovered, before) > CHANGED) | (paired_difference(true, before) > CHANGED)
     ground = binary_dilation(body | changed, iterations=2) & ~binary_dilation(body)
 
     def error(image: Image, reference: Image) -> float:
-        errors = difference(cielab(image), reference)
+        errors = paired_difference(cielab(image), reference)
         return float(max(errors[region].mean() for region in (body, ground) if region.any()))
 
     whole = error(pair.recovered, true)
@@ -235,7 +235,7 @@ def cielab(radiance: Image) -> Image:
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
 
 
-def difference(a: Image, b: Image) -> Float[np.ndarray, "h w"]:
+def paired_difference(a: Image, b: Image) -> Float[np.ndarray, "h w"]:
     """Return ΔE (CIE 1976) of each pixel of two pictures in CIELAB."""
     return np.linalg.norm(a - b, axis=-1)
 

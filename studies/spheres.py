@@ -121,19 +121,19 @@ def mislabel_pixels(
 
 
 def facet_normals(normals: Normals, facets: int | None) -> Normals:
-    """Return normals of a convex object that shows so many flat faces (`face_normals`).
+    """Return normals of a convex object that shows so many flat faces (`polyhedron_normals`).
 
     Each pixel has the normal of the face that is nearest to the sphere's, but for `CURVED` of the way.
     """
     if facets is None:
         return normals
-    faces = face_normals(facets)
+    faces = polyhedron_normals(facets)
     flat = (1 - CURVED) * faces[(normals @ faces.T).argmax(axis=1)] + CURVED * normals
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     return flat[flat[:, 2] > GRAZING]
 
 
-def face_normals(facets: int) -> Float[np.ndarray, "k 3"]:
+def polyhedron_normals(facets: int) -> Float[np.ndarray, "k 3"]:
     """Return normals of faces spread evenly over the cap of n·z > `STEEPEST` about the viewer's z.
 
     One face alone looks straight at the viewer.

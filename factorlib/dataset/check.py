@@ -314,9 +314,8 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             key = f"{key}.chrome"
             balls = list(mirror_balls(spec, name, light))
             if not balls:
-                refuse.check_known(
-                    key, light.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object"
-                )
+                names = [obj.name for photo in shots[name] for obj in photo.objects]
+                refuse.check_known(key, light.chrome, names, "object")
             photo, ball = balls[0]
             material = min(instance_materials(ball, spec))
             mesh = spec.meshes[ball.mesh]

@@ -134,7 +134,7 @@ def generate(
         progress(number, len(shots), shot.name)
         scene = arrange_scene(shot, number, lat_longs, rng, spread, parameters)
         poses[shot.name] = scene.poses
-        photos.append(write_shot(out, scene, materials, parameters, 1000 * seed + number))
+        photos.append(write_chair_shot(out, scene, materials, parameters, 1000 * seed + number))
     meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
     options = "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(parameters, name))
     options += " --rough {},{}".format(*parameters.rough) if parameters.rough else ""
@@ -210,7 +210,7 @@ def arrange_scene(
     return ChairScene(shot, around, camera, rigid(look_rotation(-down, yaw), place), chairs)
 
 
-def write_shot(
+def write_chair_shot(
     out: Path, scene: ChairScene, materials: dict[str, Reflectance], parameters: ChairSetOptions, seed: int
 ) -> dict:
     """Render, expose and write one photo, with its masks, its light in the photo's units, and its normals.

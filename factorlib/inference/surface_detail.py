@@ -402,11 +402,8 @@ def estimate_surface(
     scores = trial.score_photos([plain] * photos, tick)
     search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), scores, tick)
     turned, movable = search.select_turns()
-    selected = (
-        turned
-        if turned.evidence.accepted
-        else StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
-    )
+    unturned = StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
+    selected = turned if turned.evidence.accepted else unturned
     candidates = [Stiffness(selected.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
     nodes = trial.shared_nodes & surfaces.node_mask(movable)
     painted = search.select_stiffness(candidates, selected.scores, (0.0, CLEARLY_FOR), nodes)
@@ -418,9 +415,8 @@ def estimate_surface(
     displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.accepted else {}
     displacements = {name: displacement for name, displacement in displacements.items() if name in movable}
     factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.accepted else {}
-    return SurfaceEstimate(
-        initial, turned.evidence, painted.evidence, selected.stiffness, gains, displacements, factors
-    )
+    decisions = turned.evidence, painted.evidence
+    return SurfaceEstimate(initial, *decisions, selected.stiffness, gains, displacements, factors)
 
 
 def fit_trial(

@@ -76,7 +76,7 @@ def read_labels(
     return labels
 
 
-def read_objects(
+def read_object_indices(
     masks: list[tuple[str, str | None]], file: Callable[[str], Path], size: tuple[int, int], key: str = "objects"
 ) -> UInt16[np.ndarray, "h w"]:
     """Read the index (from 1) of the object whose own mask covers each pixel, 0 for none.
@@ -134,7 +134,7 @@ def check_materials(
 
     Args:
         labels: Labels of the photo.
-        objects: Result of `read_objects`; objects without a mask of their own share the rest of the photo.
+        objects: Result of `read_object_indices`; objects without a mask of their own share the rest of the photo.
         object_materials: Name and materials of each object.
         materials: Materials of the dataset, in order.
         path: Path of the mask, to name in errors.

@@ -19,7 +19,7 @@ from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipp
 from factorlib.meshes.obj import read_obj
 from factorlib.meshes.ply_stl_off import read_off, read_ply, read_stl
 from factorlib.meshes.subdivision import subdivided_mesh
-from factorlib.meshes.triangle_soup import NO_LIMITS, Limits, TriangleSoup, check
+from factorlib.meshes.triangle_soup import NO_LIMITS, Limits, TriangleSoup, check_soup
 from factorlib.reading import one_line, read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # formats of a single file
@@ -138,7 +138,7 @@ def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:
         else:
             soup = read_gltf(path, limits)
     limits.check_parts(len(soup.parts), path)
-    return check(soup, path)
+    return check_soup(soup, path)
 
 
 def part_labels(

@@ -142,7 +142,7 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
     return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1).astype(np.int64)
 
 
-def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
+def check_soup(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     """Check a soup and return it.
 
     Raises:

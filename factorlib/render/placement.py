@@ -260,11 +260,8 @@ def free_placement(
             if (move := smaller.nearest_move()) is not None:
                 cure = f"at {share} of its size it is free at {smaller.pixel_text(move, factor)}"
                 break
-        raise InputError(
-            f"the new object has no free place in the picture: {reason}",
-            key="at" if is_requested else "size",
-            cure=cure,
-        )
+        fault = f"the new object has no free place in the picture: {reason}"
+        raise InputError(fault, key="at" if is_requested else "size", cure=cure)
     place = space.pixel_text(move, factor)
     if is_requested and not intersected:
         raise InputError(f"the new object is invisible: {reason}", key="at", cure=f"the nearest free place is {place}")

@@ -176,7 +176,7 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
     pixels = run.read(read_png, "align", f"{photo}_overlay.png")
     if pixels is None:
         return None
-    crop = pixels[pictures.bounding_box(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
+    crop = pixels[pictures.mask_box(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
     return pictures.data_uri(pictures.downsample(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
 
 

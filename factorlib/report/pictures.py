@@ -64,7 +64,7 @@ def downsample(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.nd
     return average(average(picture).swapaxes(0, 1)).swapaxes(0, 1)
 
 
-def bounding_box(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:
+def mask_box(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:
     """Return rows and columns of the mask's bounding box; the whole picture for an empty mask.
 
     `margin` is the margin as a fraction of the box's longer side.
@@ -140,7 +140,7 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
     geometry = run.channels("align", name)
     resynthesis = run.rgb("render", f"resynthesis/{name}")
     exposure = errors.exposure if errors else 1.0
-    box = bounding_box(np.rint(masks["label"]) > 0)
+    box = mask_box(np.rint(masks["label"]) > 0)
     masks, geometry = ({k: v[box] for k, v in channels.items()} for channels in (masks, geometry))
     photo = np.nan_to_num(np.stack([masks[c] for c in "RGB"], axis=-1), posinf=0, neginf=0)
     display = picture(photo, exposure).astype(np.float32) / 255
@@ -180,7 +180,7 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
         return [photo]
     # camera cropped to the objects, and enlarged to the panel's size
     scene = results.scene(row.name)
-    box = bounding_box(np.rint(run.channels("masks", row.name)["label"]) > 0)
+    box = mask_box(np.rint(run.channels("masks", row.name)["label"]) > 0)
     top, left = (span.start for span in box)
     height, width = (span.stop - span.start for span in box)
     pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
@@ -233,7 +233,7 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[di
         if mesh in table.log_factors:
             panels["detail of reflectance"] = srgb_encode(np.clip(0.4 * maps["by shading"]["detail"], 0, 1))
         uris = {}
-        box = bounding_box(masks[photo])
+        box = mask_box(masks[photo])
         longest = longest_side(len(run.set.photos))
         for title, panel in panels.items():
             colour = panel if panel.ndim == 3 else panel[..., None].repeat(3, 2)

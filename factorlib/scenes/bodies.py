@@ -143,7 +143,7 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
 @cache
 def photographed_mesh(shape: str) -> Mesh:
     """Return the shape as it is photographed, read as a file of it would be."""
-    return join_parts(SHAPES[shape](), shape)
+    return mesh_from_parts(SHAPES[shape](), shape)
 
 
 @cache
@@ -164,7 +164,7 @@ def rough_mesh(shape: str, seed: int) -> Mesh:
         return np.sin(points @ waves.T + phases) @ shifts
 
     scale = WARP * extent / np.linalg.norm(field(vertices), axis=1).max()
-    return join_parts([(v + scale * field(v), f, label) for v, f, label in coarse], f"rough {shape}")
+    return mesh_from_parts([(v + scale * field(v), f, label) for v, f, label in coarse], f"rough {shape}")
 
 
 def decimate(part: Part, triangles: int) -> Part:
@@ -175,7 +175,7 @@ def decimate(part: Part, triangles: int) -> Part:
     return np.asarray(few.vertices), np.asarray(few.triangles), label
 
 
-def join_parts(parts: list[Part], name: str) -> Mesh:
+def mesh_from_parts(parts: list[Part], name: str) -> Mesh:
     """Return the parts as one mesh; name: what an error calls it."""
     first = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts])
     faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, first)]).astype(np.int64)

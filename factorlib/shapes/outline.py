@@ -98,7 +98,7 @@ class Triangles(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, vertices=(self.vertices - (low + high) / 2) * (size / (high - low).max()))
 
 
-def write_obj(path: Path, shape: Triangles, parts: list[str]) -> None:
+def write_triangles(path: Path, shape: Triangles, parts: list[str]) -> None:
     """Write an OBJ file with a group for each part that has faces.
 
     Args:

@@ -61,7 +61,7 @@ def posed_photo(kind: str, shape: str, seed: int, number: int) -> PosedPhoto:
     """Return the photo of that kind; the same one for the same arguments."""
     rng = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode()))
     fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
-    camera, pose, label = photograph(bodies.photographed_mesh(shape), rng, fill)
+    camera, pose, label = random_photograph(bodies.photographed_mesh(shape), rng, fill)
     truth = rasterise(bodies.photographed_mesh(shape), camera, pose)
     mesh = bodies.rough_mesh(shape, seed) if kind == "rough" else bodies.photographed_mesh(shape)
     if kind == "mirrored mask":
@@ -74,7 +74,7 @@ def posed_photo(kind: str, shape: str, seed: int, number: int) -> PosedPhoto:
     return PosedPhoto(camera, pose, np.ascontiguousarray(label), mesh, truth)
 
 
-def photograph(mesh: Mesh, rng: np.random.Generator, fill: float) -> tuple[Camera, Pose, Int[np.ndarray, "h w"]]:
+def random_photograph(mesh: Mesh, rng: np.random.Generator, fill: float) -> tuple[Camera, Pose, Int[np.ndarray, "h w"]]:
     """Return a camera, a pose that the frame does not cut, and the labels of the visible object."""
     focal = WIDTH * float(np.exp(rng.uniform(*np.log(FOCALS))))
     camera = Camera(WIDTH, HEIGHT, focal, (WIDTH / 2, HEIGHT / 2))
