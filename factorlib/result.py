@@ -382,7 +382,7 @@ class RenderedFiles(dict[str, bytes]):
             write_bytes(path, data)
 
     def __repr__(self) -> str:
-        return f"Drawn: {', '.join(name for name in self if '/' not in name)}"
+        return f"Files: {', '.join(name for name in self if '/' not in name)}"
 
     def _repr_html_(self) -> str:
         name = next(name for kind in (".gif", ".png") for name in self if name.endswith(kind))
