@@ -135,9 +135,8 @@ class Validation:
         check_pixels(size, most_megapixels, path, f"{key}.image")
         check_values(path, most_megapixels, f"{key}.image")
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
-        objects = read_object_indices(
-            [(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects"
-        )
+        object_masks = [(obj.name, obj.mask) for obj in entry.objects]
+        objects = read_object_indices(object_masks, self.file, size, f"{key}.objects")
         object_materials = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
         masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
         check_materials(labels, objects, object_materials, self.spec.materials, self.file(masks), f"{key}.objects")
