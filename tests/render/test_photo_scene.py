@@ -375,7 +375,7 @@ CASES = [
 @pytest.mark.parametrize("other, point, words, cure", CASES)
 def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked(other, point, words, cure):
     spot = Spot(LOW, np.array(point), 0.8)
-    error = refusal(words, free_placement, scene_of(other), stand, spot, asked=True)
+    error = refusal(words, free_placement, scene_of(other), stand, spot, is_requested=True)
     assert error.key == "at" and cure in error.cure
     new, there, said = free_placement(scene_of(other), stand, spot, is_requested=False)
     assert words in said
@@ -394,7 +394,7 @@ def test_an_object_that_fits_nowhere_is_refused_with_a_size_that_does():
         scene_of(at(sphere(0.3), (0, 0, -5.7))),
         stand,
         spot,
-        asked=False,
+        is_requested=False,
     )
     assert error.key == "size" and "of its size it is free at `at: [" in error.cure
 
