@@ -35,14 +35,14 @@ def project() -> Project:
 
     Without a checkout, it is the current folder with the pipeline that pip installed with the package.
     """
-    here = Path.cwd()
-    checkout = next((folder for folder in (LIBRARY, here, *here.parents) if (folder / PIPELINE).is_file()), None)
+    cwd = Path.cwd()
+    checkout = next((folder for folder in (LIBRARY, cwd, *cwd.parents) if (folder / PIPELINE).is_file()), None)
     if not (root := os.environ.get("FACTORLIB_ROOT") or checkout):
         for shipped in (folder / SHIPPED for folder in (LIBRARY, *LIBRARY.parents)):
             if (shipped / PIPELINE).is_file():
-                return Project(here, photo_sets(), shipped=shipped)
+                return Project(cwd, photo_sets(), shipped=shipped)
         cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<folder with {PIPELINE}, stages and data>"
-        raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=here, cure=cure)
+        raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=cwd, cure=cure)
     return Project(Path(root).resolve(), photo_sets())
 
 
@@ -167,7 +167,7 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
 }  # fmt: skip
 
 
-def run(words: list[str], program: str) -> int:
+def dispatch(words: list[str], program: str) -> int:
     """Run the verb of the command line and return its exit code.
 
     A first word that is neither an option nor a verb is a stage.
@@ -211,7 +211,9 @@ def main() -> NoReturn:
     try:
         with printable_streams(), raise_on_signals():
             logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
-            sys.exit(run(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib"))
+            sys.exit(
+                dispatch(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib")
+            )
     except InputError as error:
         sys.exit(printable(f"error: {error}"))
     except BrokenPipeError:  # The reader, such as `head`, has closed the pipe.

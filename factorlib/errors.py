@@ -34,9 +34,9 @@ class InputError(ValueError):
         super().__init__(fault)
 
     def __str__(self) -> str:
-        where = "".join(f"{part}: " for part in (self.file, self.key) if part is not None)
+        location = "".join(f"{part}: " for part in (self.file, self.key) if part is not None)
         cure = f"\n  {self.cure}" if self.cure else ""
-        return f"{where}{self.fault}{cure}"
+        return f"{location}{self.fault}{cure}"
 
     def __reduce__(self) -> tuple:  # for pickling in a worker process
         return partial(InputError, self.fault, file=self.file, key=self.key, cure=self.cure), ()
@@ -78,7 +78,7 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
     known = sorted(str(k) for k in known)
     word = word.strip("[]'\"")
     compared = known[:MOST_COMPARED]
-    alike = [k for k in compared if k[:1] == word[:1]]
-    near = get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, alike, 1)
+    same_initial = [k for k in compared if k[:1] == word[:1]]
+    near = get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, same_initial, 1)
     more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""
     return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known[:MOST_LISTED])) + more

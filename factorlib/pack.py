@@ -32,7 +32,7 @@ In Python: factorlib.load_result("<this folder>")
 """
 
 
-def pack(home: Path, out: Path, replace: bool = False) -> int:
+def write_pack(home: Path, out: Path, replace: bool = False) -> int:
     """Write a result into a zip file, in a folder of the data set's name, and return the number of files.
 
     Args:

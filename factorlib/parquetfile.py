@@ -22,7 +22,7 @@ MOST_BYTES = 8192  # bytes of one value: one for each direction of visibility
 
 def read_columns(
     path: str | Path,
-    what: str,
+    kind: str,
     needed: Iterable[str],
     optional: Iterable[str] = (),
     cure: str = "",
@@ -32,7 +32,7 @@ def read_columns(
 
     Args:
         path: the file
-        what: the kind of file with its article, for messages
+        kind: the kind of file with its article, for messages
         needed: names of required columns
         optional: names of columns to read if they exist
         cure: cure for a rejected file
@@ -41,8 +41,8 @@ def read_columns(
     Raises:
         InputError: The file is not Parquet, has too many rows, or lacks a needed column.
     """
-    check_plain(path, what, most_bytes=None)
-    with reading(what, path, cure=cure, also=(pa.ArrowException,)), pq.ParquetFile(path) as file:
+    check_plain(path, kind, most_bytes=None)
+    with reading(kind, path, cure=cure, also=(pa.ArrowException,)), pq.ParquetFile(path) as file:
         schema = file.schema_arrow
         if file.metadata.num_rows > most_rows:
             raise ValueError(f"{file.metadata.num_rows:,} rows, more than {most_rows:,}")
@@ -50,8 +50,8 @@ def read_columns(
         for name in names:
             if schema.names.count(name) != 1:
                 raise ValueError(f"it has {schema.names.count(name)} columns {name!r}")
-            if not _is_readable(kind := schema.field(name).type):
-                raise ValueError(f"column {name!r} is of type {kind}")
+            if not _is_readable(column_type := schema.field(name).type):
+                raise ValueError(f"column {name!r} is of type {column_type}")
         table = file.read(columns=names)
         columns = {name: table[name].combine_chunks() for name in names}
         for name, column in columns.items():
@@ -80,7 +80,7 @@ def write_rows(path: str | Path, type_: type[msgspec.Struct], rows: Sequence[msg
 def _is_readable(kind: pa.DataType) -> bool:
     """Return True if a column holds numbers, lists of three of them, text, or bytes of a fixed length."""
     is_list = pa.types.is_fixed_size_list(kind)
-    of = kind.value_type if is_list else kind
-    if pa.types.is_integer(of) or pa.types.is_floating(of) or pa.types.is_boolean(of):
+    value_type = kind.value_type if is_list else kind
+    if pa.types.is_integer(value_type) or pa.types.is_floating(value_type) or pa.types.is_boolean(value_type):
         return not is_list or kind.list_size == 3
     return pa.types.is_string(kind) or (pa.types.is_fixed_size_binary(kind) and 0 < kind.byte_width <= MOST_BYTES)

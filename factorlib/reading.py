@@ -56,7 +56,7 @@ CURES = {
 
 @contextmanager
 def reading(
-    what: str,
+    kind: str,
     file: str | os.PathLike | None,
     key: str | None = None,
     cure: str = COPY_AGAIN,
@@ -65,7 +65,7 @@ def reading(
     """Convert exceptions of a parser to InputError with file and key; an InputError passes unchanged.
 
     Args:
-        what: the kind of file with its article, as in "not readable as {what}"
+        kind: the kind of file with its article, as in "not readable as {kind}"
         file: the file
         key: the key that names the file
         cure: cure, unless the system's error (no permission, no such file, …) has a better one
@@ -77,10 +77,10 @@ def reading(
         raise
     except (*FAILURES, *also) as error:  # type: ignore[misc]
         cure = CURES.get(error.errno, cure) if isinstance(error, OSError) else cure  # type: ignore[arg-type]
-        raise InputError(_fault(error, what), file=file, key=key, cure=cure) from error
+        raise InputError(_fault(error, kind), file=file, key=key, cure=cure) from error
 
 
-def _fault(error: BaseException, what: str) -> str:
+def _fault(error: BaseException, kind: str) -> str:
     """Describe an error in one line.
 
     >>> _fault(PermissionError(13, "Permission denied"), "a mesh")
@@ -89,15 +89,15 @@ def _fault(error: BaseException, what: str) -> str:
     'not readable as a mesh (IndexError: list index out of range)'
     """
     if isinstance(error, RecursionError):
-        return f"not readable as {what}: it is nested too deeply"
+        return f"not readable as {kind}: it is nested too deeply"
     if isinstance(error, MemoryError):
-        return f"not readable as {what}: it does not fit into memory"
+        return f"not readable as {kind}: it does not fit into memory"
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
     words = one_line(str(error))
     if not words or isinstance(error, LookupError | TypeError | AttributeError | AssertionError):  # terse messages
         words = ": ".join(filter(None, (type(error).__name__, words)))
-    return f"not readable as {what} ({words})"
+    return f"not readable as {kind} ({words})"
 
 
 def one_line(text: str) -> str:
@@ -110,61 +110,61 @@ def one_line(text: str) -> str:
     return flat if len(flat) <= MOST_WORDS else flat[: MOST_WORDS - 1] + "…"
 
 
-def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int | None = MOST_BYTES) -> int:
+def check_plain(file: str | os.PathLike, kind: str, key: str | None = None, most_bytes: int | None = MOST_BYTES) -> int:
     """Return the size in bytes of a plain, readable file, with links followed; nothing of it is read.
 
     Args:
         file: the file
-        what: the kind of file with its article, for messages
+        kind: the kind of file with its article, for messages
         key: the key that names the file
         most_bytes: largest size; None for any
 
     Raises:
         InputError: The file does not exist, is not readable, is a folder, pipe or device, or is too large.
     """
-    with reading(what, file, key):
+    with reading(kind, file, key):
         status = os.stat(file)
         if not stat.S_ISREG(status.st_mode):
             fault = f"is {KINDS.get(stat.S_IFMT(status.st_mode), 'no plain file')}, not a file"
-            raise InputError(fault, file=file, key=key, cure=f"put {what} there, or correct the path")
+            raise InputError(fault, file=file, key=key, cure=f"put {kind} there, or correct the path")
         if not os.access(file, os.R_OK, effective_ids=os.access in os.supports_effective_ids):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     if most_bytes is not None and status.st_size > most_bytes:
-        fault = f"has {status.st_size / 1e6:,.1f} MB; {what} has {most_bytes / 1e6:,.1f} MB at most"
+        fault = f"has {status.st_size / 1e6:,.1f} MB; {kind} has {most_bytes / 1e6:,.1f} MB at most"
         raise InputError(fault, file=file, key=key, cure="name another file, or make this one smaller")
     return status.st_size
 
 
-def read_bytes(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> bytes:
+def read_bytes(file: str | os.PathLike, kind: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> bytes:
     """Read the whole content of a plain file.
 
     Args:
         file: the file
-        what: the kind of file with its article, for messages
+        kind: the kind of file with its article, for messages
         key: the key that names the file
         most_bytes: largest size
 
     Raises:
         InputError: As for `check_plain`.
     """
-    size = check_plain(file, what, key, most_bytes)
-    with reading(what, file, key), open(file, "rb") as stream:
+    size = check_plain(file, kind, key, most_bytes)
+    with reading(kind, file, key), open(file, "rb") as stream:
         return stream.read(size)  # bounded, even if the file has grown
 
 
-def read_text(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> str:
+def read_text(file: str | os.PathLike, kind: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> str:
     """Read a plain file as UTF-8 text, without a byte order mark.
 
     Args:
         file: the file
-        what: the kind of file with its article, for messages
+        kind: the kind of file with its article, for messages
         key: the key that names the file
         most_bytes: largest size
 
     Raises:
         InputError: As for `check_plain`, or the file is not UTF-8.
     """
-    content = read_bytes(file, what, key, most_bytes)
+    content = read_bytes(file, kind, key, most_bytes)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -180,12 +180,12 @@ def path_inside(folder: str | os.PathLike, path: str) -> Path:
     """
     target = Path(folder) / path
     try:
-        where = target.resolve()
+        resolved = target.resolve()
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # reported when the file is opened
             os.stat(target)
     except (OSError, RuntimeError, ValueError) as error:
         words = one_line(getattr(error, "strerror", None) or str(error))
         raise ValueError(f"is no path that can be followed ({words})") from error
-    if not path or Path(path).is_absolute() or not where.is_relative_to(Path(folder).resolve()):
+    if not path or Path(path).is_absolute() or not resolved.is_relative_to(Path(folder).resolve()):
         raise ValueError("leads outside the dataset")
     return target

@@ -38,12 +38,20 @@ from factorlib.pack import check_whole
 from factorlib.reading import check_plain
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
-from factorlib.recipe.read import check_recipe, files_of
-from factorlib.render.photo_scene import DistantLight, Orbit, PhotoScene, TracedPicture, as_it_is, resized, traced_photo
+from factorlib.recipe.read_recipe import check_recipe, files_of
+from factorlib.render.photo_scene import (
+    DistantLight,
+    Orbit,
+    PhotoScene,
+    TracedPicture,
+    identity_tone,
+    resize_scene,
+    traced_photo,
+)
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
 from factorlib.report.pictures import data_uri
-from factorlib.results.materials import Solved
+from factorlib.results.materials import SolvedMaterial
 from factorlib.stage import Inputs, silent
 from factorlib.wholefile import write_bytes
 from factorlib.yamlfile import convert
@@ -113,13 +121,13 @@ class UnknownName(InputError, KeyError):
 class Named(Mapping[str, T]):
     """A mapping whose error for a missing name lists the known ones."""
 
-    def __init__(self, what: str, table: Mapping[str, T]):
-        self._what = what
+    def __init__(self, kind: str, table: Mapping[str, T]):
+        self._kind = kind
         self._table = table
 
     def __getitem__(self, name: str) -> T:
         if not isinstance(name, str) or name not in self._table:
-            raise UnknownName(f"there is no {self._what} {name!r}", cure=did_you_mean(str(name), self._table))
+            raise UnknownName(f"there is no {self._kind} {name!r}", cure=did_you_mean(str(name), self._table))
         return self._table[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -129,7 +137,7 @@ class Named(Mapping[str, T]):
         return len(self._table)
 
     def __repr__(self) -> str:
-        return f"{self._what}s: {', '.join(self._table)}"
+        return f"{self._kind}s: {', '.join(self._table)}"
 
 
 class Result:
@@ -144,7 +152,9 @@ class Result:
     def __init__(self, folder: Path, solved: SolvedSet):
         self.folder = folder
         self._solved = solved
-        self.materials: Named[Solved] = Named("material", {name: solved.table.materials[name] for name in solved.names})
+        self.materials: Named[SolvedMaterial] = Named(
+            "material", {name: solved.table.materials[name] for name in solved.names}
+        )
         self.photos = solved.photos
 
     @property
@@ -187,7 +197,7 @@ class Result:
         """
         photo = self._photo(view)
         _check(kinds.ViewRecipe, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
-        scene = resized(self._solved.scene(photo), width)
+        scene = resize_scene(self._solved.scene(photo), width)
         traced = traced_photo(scene, samples, Orbit(azimuth, elevation, zoom).world_from_camera(scene))
         return Picture(traced, self._solved.tone(photo), photo)
 
@@ -210,14 +220,14 @@ class Result:
         photo, obj = self._object(name)
         light = str(light) if isinstance(light, Path) else light
         _check(kinds.RelightRecipe, width=width, samples=samples)
-        scene = resized(self._solved.scene(photo), width)
+        scene = resize_scene(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == obj)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
-        of_photo = light if isinstance(light, str) and light in self.photos else None
+        light_photo = light if isinstance(light, str) and light in self.photos else None
         about = f"{photo}/{obj} in {light if isinstance(light, str) else 'a given light'}"
-        return Picture(traced, as_it_is if of_photo is None else self._solved.tone(of_photo), about)
+        return Picture(traced, identity_tone if light_photo is None else self._solved.tone(light_photo), about)
 
-    def insert(self, photo: str, **fields: Any) -> Drawn:
+    def insert(self, photo: str, **fields: Any) -> RenderedFiles:
         """Insert a further object on the ground of a photo, with its shadow.
 
         Args:
@@ -228,9 +238,9 @@ class Result:
         Raises:
             InputError: A name or field is unknown, or the object has no place.
         """
-        return self._drawn("insert", photo, fields)
+        return self._render_recipe("insert", photo, fields)
 
-    def turntable(self, photo: str, **fields: Any) -> Drawn:
+    def turntable(self, photo: str, **fields: Any) -> RenderedFiles:
         """Render one turn around the objects of a photo, as GIF and frames.
 
         Args:
@@ -240,9 +250,9 @@ class Result:
         Raises:
             InputError: As for `insert`.
         """
-        return self._drawn("turntable", photo, fields)
+        return self._render_recipe("turntable", photo, fields)
 
-    def transfer(self, photo: str, materials: Mapping[str, str], **fields: Any) -> Drawn:
+    def transfer(self, photo: str, materials: Mapping[str, str], **fields: Any) -> RenderedFiles:
         """Render a photo with other materials on its objects.
 
         Args:
@@ -253,21 +263,21 @@ class Result:
         Raises:
             InputError: As for `insert`.
         """
-        return self._drawn("transfer", photo, {"materials": materials, **fields})
+        return self._render_recipe("transfer", photo, {"materials": materials, **fields})
 
-    def _drawn(self, kind: str, photo: str, fields: dict[str, Any]) -> Drawn:
+    def _render_recipe(self, kind: str, photo: str, fields: dict[str, Any]) -> RenderedFiles:
         """Render a recipe for one photo."""
         recipe = _check(KINDS[kind], photos=[photo], **fields)
         path = Path(kind)
         inputs = self._solved.inputs
         objects = {name: each.objects for name, each in self._solved.objects.items()}
         check_recipe(recipe, path, objects, self._solved.names)
-        given = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
-        solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | given))
+        recipe_files = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
+        solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | recipe_files))
         with TemporaryDirectory() as out:
             draw(recipe, solved, Path(out), silent)
             files = sorted(path for path in Path(out).rglob("*") if path.is_file())
-            return Drawn({path.relative_to(out).as_posix(): path.read_bytes() for path in files})
+            return RenderedFiles({path.relative_to(out).as_posix(): path.read_bytes() for path in files})
 
     def scene(self, photo: str) -> PhotoScene:
         """Return the photo's camera, objects and light, for custom pictures (`factorlib.render.photo_scene`)."""
@@ -359,7 +369,7 @@ class Picture(TracedPicture, frozen=True):
         return _image(self.rgba(min(1.0, self.exposure))) + f"<br>{html.escape(self.about)}"
 
 
-class Drawn(dict[str, bytes]):
+class RenderedFiles(dict[str, bytes]):
     """The files that a recipe makes of a photo, by name.
 
     They are PNG (8-bit sRGB), EXR (linear) and, for an animation, a GIF and its frames.
@@ -372,7 +382,7 @@ class Drawn(dict[str, bytes]):
             write_bytes(path, data)
 
     def __repr__(self) -> str:
-        return f"Drawn: {', '.join(name for name in self if '/' not in name)}"
+        return f"Files: {', '.join(name for name in self if '/' not in name)}"
 
     def _repr_html_(self) -> str:
         name = next(name for kind in (".gif", ".png") for name in self if name.endswith(kind))

@@ -77,8 +77,8 @@ def make_venv() -> None:
     if find_spec("ensurepip") is None:  # Debian has it in a separate package.
         sys.exit(f"set-up: this Python has no venv; install it: sudo apt-get install python{version}-venv")
     READY.unlink(missing_ok=True)
-    same = (VENV / "lib" / f"python{version}").is_dir()
-    venv.create(VENV, clear=not same, with_pip=True, symlinks=True)
+    is_same_version = (VENV / "lib" / f"python{version}").is_dir()
+    venv.create(VENV, clear=not is_same_version, with_pip=True, symlinks=True)
 
 
 def install_packages() -> None:
@@ -88,8 +88,8 @@ def install_packages() -> None:
     """
     index = os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
     pip("--no-deps", "-r", str(LOCK))
-    alone = ["--no-deps"] if index == TORCH_CPU else ["-c", str(LOCK)]
-    pip(*alone, TORCH, *(["--index-url", index] if index else []))
+    options = ["--no-deps"] if index == TORCH_CPU else ["-c", str(LOCK)]
+    pip(*options, TORCH, *(["--index-url", index] if index else []))
     # The path is relative, so that the checkout can be moved.  `import factorlib` then works from anywhere.
     next(VENV.glob("lib/python*/site-packages")).joinpath("factorlib.pth").write_text("../../../..\n")
 

@@ -15,13 +15,13 @@ import numpy as np
 from factorlib.dataset.check import MESHES, instance_materials, mirror_balls
 from factorlib.dataset.schema import Dataset, MeshInstance, PhotoEntry
 from factorlib.errors import InputError
-from factorlib.evaluate.comparison_gauge import connected_components
+from factorlib.evaluate.comparison_gauge import material_components
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
-from factorlib.labels.labels import check_materials, read_labels, read_objects
-from factorlib.meshes.read import part_labels, read_mesh, read_parts
+from factorlib.labels.label_image import check_materials, read_labels, read_object_indices
+from factorlib.meshes.read_mesh import part_labels, read_mesh, read_parts
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.recipe.kinds import is_light_file
 from factorlib.yamlfile import convert
@@ -50,7 +50,7 @@ class Validation:
             settings: the file that gives them, for errors
         """
         checks = dict(self._checks(slice_, photo, params, settings))
-        new = [check for what, check in checks.items() if what not in self._done]
+        new = [check for check_name, check in checks.items() if check_name not in self._done]
         self._done |= checks.keys()
         return _faults(new)
 
@@ -67,19 +67,19 @@ class Validation:
 
         Brightness and colour cannot be compared between such groups.
         """
-        together: dict[str, set[str]] = {}
+        by_light: dict[str, set[str]] = {}
         for photo in self.spec.photos:
-            together.setdefault(photo.light, set()).update(
+            by_light.setdefault(photo.light, set()).update(
                 *(instance_materials(obj, self.spec) for obj in photo.objects)
             )
-        component = connected_components({light: sorted(names) for light, names in together.items() if names})
+        component = material_components({light: sorted(names) for light, names in by_light.items() if names})
         if (groups := len(set(component.values()))) < 2:
             return []
-        lights = sorted(light for light, names in together.items() if names)
-        members = [[light for light in lights if component[min(together[light])] == k] for k in range(groups)]
-        said = "; ".join(map(", ".join, members))
+        lights = sorted(light for light, names in by_light.items() if names)
+        members = [[light for light in lights if component[min(by_light[light])] == k] for k in range(groups)]
+        group_list = "; ".join(map(", ".join, members))
         return [
-            f"the lights fall into {groups} groups that share no material ({said}): "
+            f"the lights fall into {groups} groups that share no material ({group_list}): "
             "brightness and colour cannot be compared between them. "
             "A photo that shows a material of each would link them"
         ]
@@ -98,12 +98,12 @@ class Validation:
                     continue
                 yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, file, limits)
         elif slice_ == "known":
-            for name, of in self.spec.known.illumination.items():
+            for name, light in self.spec.known.illumination.items():
                 key = f"known.illumination.{name}"
-                if isinstance(of, str):
-                    yield f"light {of}", partial(read_light_map, self.file(of), key)
+                if isinstance(light, str):
+                    yield f"light {light}", partial(read_light_map, self.file(light), key)
                 else:
-                    ball = next(mirror_balls(self.spec, name, of))[1]
+                    ball = next(mirror_balls(self.spec, name, light))[1]
                     yield f"ball {name}", partial(self._ball, ball, f"{key}.chrome")
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():
@@ -115,8 +115,8 @@ class Validation:
         """Check that a mirror ball is round: its vertices are equally far from the centre of its bounding box."""
         if (file := self.spec.meshes[obj.mesh].file) is None:
             return
-        made = self.spec.meshes[obj.mesh].part_materials
-        points = read_mesh(self.file(file), self.spec.materials, made, obj.materials).vertices
+        part_materials = self.spec.meshes[obj.mesh].part_materials
+        points = read_mesh(self.file(file), self.spec.materials, part_materials, obj.materials).vertices
         radius = np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1)
         if np.ptp(radius) > NOT_ROUND * radius.max():
             raise InputError(
@@ -138,10 +138,11 @@ class Validation:
         check_pixels(size, most_megapixels, path, f"{key}.image")
         check_values(path, most_megapixels, f"{key}.image")
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
-        objects = read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
-        own = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
+        object_masks = [(obj.name, obj.mask) for obj in entry.objects]
+        objects = read_object_indices(object_masks, self.file, size, f"{key}.objects")
+        object_materials = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
         masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
-        check_materials(labels, objects, own, self.spec.materials, self.file(masks), f"{key}.objects")
+        check_materials(labels, objects, object_materials, self.spec.materials, self.file(masks), f"{key}.objects")
 
     def _object(self, obj: MeshInstance, relative: str, limits: Limits) -> None:
         """Check the parts of a mesh file, which is read once; a failure is raised again for every object."""

@@ -272,8 +272,8 @@ def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:
         fields = msgspec.structs.fields(type_)
         yield from ((f.encode_name, value[f.encode_name], f.type) for f in fields if f.encode_name in value)
     elif isinstance(value, list) and origin in (list, tuple):
-        same = origin is list or args[-1:] == (...,)
-        yield from zip(range(len(value)), value, args[:1] * len(value) if same else args)
+        is_homogeneous = origin is list or args[-1:] == (...,)
+        yield from zip(range(len(value)), value, args[:1] * len(value) if is_homogeneous else args)
 
 
 def _is_struct(type_: Any) -> bool:

@@ -24,11 +24,11 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.lens import radial_lens
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
-from factorlib.meshes.mesh import scaled
-from factorlib.meshes.read import CREASE_DEG, read_mesh
+from factorlib.meshes.mesh import scale_mesh
+from factorlib.meshes.read_mesh import CREASE_DEG, read_mesh
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectPose, PhotoPoses, entry_of, read_poses
+from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectPose, PhotoPoses, pose_fields, read_poses
 from factorlib.results.shape_table import read_shapes
 from factorlib.stage import Inputs, Progress
 
@@ -72,8 +72,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     # given data: refuse objects behind the camera, warn of materials that do not match and of an unlikely camera
     for obj, source in zip(objects, sources, strict=True):
         if obj.pose is not None:
-            given_by = "dataset" if source is None or source == "given" else source
-            check_before_camera(obj.caster.mesh, obj.pose, name, obj.name, given_by)
+            pose_source = "dataset" if source is None or source == "given" else source
+            check_before_camera(obj.caster.mesh, obj.pose, name, obj.name, pose_source)
     object_labels = [obj.caster.mesh.labels for obj in objects]
     warn_of_materials(channels["label"], object_labels, inputs.facts["dataset.materials"], name)
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
@@ -135,22 +135,22 @@ def read_objects(
     materials = inputs.facts["dataset.materials"]
     for number, entry in enumerate(slice_.objects, start=1):
         mesh_entry = slice_.meshes[entry.mesh]
-        given = entry.pose
+        fixed_pose = entry.pose
         keypoints = None
-        if given is None and slice_.external:
-            given = slice_.external.poses.get(entry.name)
-        before = earlier.objects.get(entry.name) if earlier and given is None else None
+        if fixed_pose is None and slice_.external:
+            fixed_pose = slice_.external.poses.get(entry.name)
+        before = earlier.objects.get(entry.name) if earlier and fixed_pose is None else None
         file = inputs.mesh(entry.mesh, mesh_entry.file)
         scale = before.scale if before else AS_IT_IS
         mesh = read_mesh(file, materials, mesh_entry.part_materials, entry.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, mesh.labels, entry.mask is not None)
-        pose = Pose(np.array(given.rotation), np.array(given.translation)) if given is not None else None
+        pose = Pose(np.array(fixed_pose.rotation), np.array(fixed_pose.translation)) if fixed_pose is not None else None
         if entry.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
             pixels = np.array([keypoint.pixel for keypoint in entry.keypoints]) / factor
             points = np.array([keypoint.point for keypoint in entry.keypoints])
             lens = radial_lens(slice_.camera, factor, *channels["label"].shape[::-1])
-            keypoints = Keypoints(lens.undistorted(pixels) if lens else pixels, points)
-        caster = Caster(scaled(mesh, scale))
+            keypoints = Keypoints(lens.undistort(pixels) if lens else pixels, points)
+        caster = Caster(scale_mesh(mesh, scale))
         objects.append(ObjectToAlign(entry.name, caster, silhouette, pose, keypoints, before, scale))
     return objects
 
@@ -177,7 +177,7 @@ def object_entry(
     measures = measure_reliability(obj, result, k)
     reasons = find_doubts(iou, agreement, measures, estimate, params)
     return ObjectPose(
-        **entry_of(result.poses[k]),
+        **pose_fields(result.poses[k]),
         scale=obj.scale,
         silhouette_iou=iou,
         label_agreement=agreement,

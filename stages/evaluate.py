@@ -12,8 +12,8 @@ import numpy as np
 
 from factorlib.dataset.schema import LightSlice, TruthFile
 from factorlib.evaluate.ball import OctahedralLight, octahedral_light
-from factorlib.evaluate.comparison_gauge import connected_components
-from factorlib.evaluate.picture_errors import ComparedPhoto, compare_photos, compared_photo
+from factorlib.evaluate.comparison_gauge import material_components
+from factorlib.evaluate.picture_errors import ComparedPhoto, combine_photo, compare_photos
 from factorlib.evaluate.relighting import (
     compare_lights,
     compare_relighting,
@@ -22,7 +22,7 @@ from factorlib.evaluate.relighting import (
     sphere_row,
 )
 from factorlib.evaluate.truth import (
-    averaged_normals,
+    average_normals,
     compare_materials,
     normal_error,
     pose_error,
@@ -61,20 +61,20 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
     materials = inputs.facts["dataset.materials"]
-    done = count()
+    counter = count()
     total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
 
     def read_photo(name: str) -> ComparedPhoto:
         """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
-        progress(next(done), total, f"re-synthesis of {name}")
+        progress(next(counter), total, f"re-synthesis of {name}")
         photo = read_exr(inputs["masks"] / f"{name}.exr")
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
-        return compared_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+        return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
     resynthesis = compare_photos(lights, materials, read_photo)
     # connected components of the graph of materials and lights
     observed = _observed_materials(resynthesis, lights)
-    component = connected_components({light: names for light, names in observed.items() if names})
+    component = material_components({light: names for light, names in observed.items() if names})
     sections = dict.fromkeys(MISSING)
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
@@ -84,14 +84,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             "materials": lambda: compare_materials(estimates, true, component),
             "relighting": lambda: compare_relighting(estimates, true, estimated_lights, true_lights, observed),
             "relit_set": lambda: compare_relit_set(estimates, true, estimated_lights, true_lights),
-            "light": lambda: compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
+            "light": lambda: compare_lights(estimated_lights, true_lights, _mirrored_directions(inputs, lights)),
             "normals": lambda: _normals(inputs, truth, lights),
             "poses": lambda: _poses(inputs, truth),
         }
         for name, section in compute.items():
-            progress(next(done), total, name)
+            progress(next(counter), total, name)
             sections[name] = section()
-    progress(next(done), total, "verdict")
+    progress(next(counter), total, "verdict")
     sections["verdict"] = _verdict(inputs, observed)
     counts = Counts(len(lights), len(materials), len(observed), len(set(component.values())))
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
@@ -160,7 +160,7 @@ def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.nda
     return normal, view, observed_pixels(read_exr(inputs["masks"] / f"{name}.exr"), geometry)
 
 
-def _mirrored(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.ndarray]:
+def _mirrored_directions(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.ndarray]:
     """Return, by light, a mask of the directions that an observed pixel mirrors."""
     mirrored: dict[str, np.ndarray] = {}
     for name, slice_ in lights.items():
@@ -178,7 +178,7 @@ def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) ->
     for name in [name for name in lights if name in truth.normals]:
         true = read_true_normals(inputs.file(truth.normals[name]), name, photos[name].original_size)
         normal, _, pixels = _geometry(inputs, name)
-        errors[name] = normal_error(normal, averaged_normals(true, photos[name].factor), pixels)
+        errors[name] = normal_error(normal, average_normals(true, photos[name].factor), pixels)
     return {name: error for name, error in errors.items() if error} or None
 
 

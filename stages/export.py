@@ -28,7 +28,7 @@ from factorlib.export.exported_scene import (
     DIRECT,
     ExportedScene,
     ExposedMap,
-    suns_of,
+    extract_suns,
     write_scene_json,
     write_script,
 )
@@ -43,7 +43,7 @@ from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply_stl_off import write_ply
-from factorlib.meshes.read import CREASE_DEG
+from factorlib.meshes.read_mesh import CREASE_DEG
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, Reflectance, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
@@ -74,8 +74,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     meshes = dict(sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()))
     total = 1 + len({light.illumination for light in slices.values()}) + len(meshes) + len(slices)
-    done = count()
-    progress(next(done), total, "materials")
+    counter = count()
+    progress(next(counter), total, "materials")
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
     table, solved, exposures = _solution_in_gauge(inputs["solve"], slices)
@@ -85,11 +85,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     _write_tables(out, materials, solved)
     _write_dataset(out, inputs)
     for name, lobes in solved.items():
-        progress(next(done), total, f"light of {name}")
+        progress(next(counter), total, f"light of {name}")
         _write_light(out, name, lobes, inputs["solve"] / "coverage" / f"{name}.exr", params)
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
     for name, mesh in meshes.items():
-        progress(next(done), total, f"mesh {name}")
+        progress(next(counter), total, f"mesh {name}")
         overrides = [o.materials for each in objects.values() for o in each.objects if o.mesh == name and o.materials]
         labels = {variant_name(each): files.read.mesh(name, mesh, each).face_label for each in overrides}
         whole = files.read.mesh(name, mesh)
@@ -99,7 +99,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     poses = read_poses(inputs["align"] / "poses.json")
     depth = ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, slice_ in slices.items():
-        progress(next(done), total, f"scene of {photo}")
+        progress(next(counter), total, f"scene of {photo}")
         height, width = read_exr(inputs["align"] / f"{photo}.exr")["label"].shape
         camera = poses[photo].camera.camera(width, height)
         placed = objects[photo]
@@ -128,7 +128,7 @@ def _solution_in_gauge(
             log.warning(
                 "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
             )
-        lights[name] = solved.get(name, no_lobes()).scaled(1 / factor)
+        lights[name] = solved.get(name, no_lobes()).scale(1 / factor)
     return table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json")
 
 
@@ -137,7 +137,7 @@ def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mappi
     write_lobes(out / "lobes.parquet", lights)
     write_text(out / "materials.mtlx", materialx(materials))
     write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
-    suns = {name: [sun.plain() for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
+    suns = {name: [sun.to_dict() for sun in extract_suns(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
         raise InputError(
             f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'",
@@ -162,7 +162,7 @@ def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, 
     write_usd_scene(folder / f"{photo}{SUFFIX}", scene)
     light = scene.light
     exposure = light.exposure
-    suns = suns_of(lobes.scaled(exposure), YUP_FROM_CAMERA @ light.camera_from_light)
+    suns = extract_suns(lobes.scale(exposure), YUP_FROM_CAMERA @ light.camera_from_light)
     name = PurePosixPath(light.file).stem
     sky = f"../illumination/{name}{SKY}.exr" if suns else light.file
     scene = msgspec.structs.replace(scene, light=msgspec.structs.replace(light, file=sky), suns=suns)
@@ -171,7 +171,7 @@ def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, 
         light = msgspec.structs.replace(light, file=f"light/{name}.exr")
     else:  # Mitsuba scales all channels alike, so the photo gets its own map; no illumination has a dot in its name
         light = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), light.camera_from_light)
-        _write_mitsuba_map(folder / light.file, lobes.take(~lobes.suns).scaled(exposure), params)
+        _write_mitsuba_map(folder / light.file, lobes.take(~lobes.suns).scale(exposure), params)
     write_scene(folder / f"{photo}.xml", msgspec.structs.replace(scene, light=light))
 
 
@@ -195,7 +195,7 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     sky = light.take(~light.suns)
     if light.suns.any():
         write_rgb_exr(out / "illumination" / f"{name}{SKY}.exr", lat_long_of_lobes(sky, *lat_long.shape[:2]), LAT_LONG)
-        write_suns(out / "illumination" / f"{name}_suns.gltf", suns_of(light, YUP_FROM_CAMERA))
+        write_suns(out / "illumination" / f"{name}_suns.gltf", extract_suns(light, YUP_FROM_CAMERA))
     _write_mitsuba_map(out / "scenes" / "light" / f"{name}.exr", sky, params)
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)

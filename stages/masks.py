@@ -15,12 +15,12 @@ from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.camera_files import is_raw
 from factorlib.images.exr import write_exr
-from factorlib.images.lens import Undistorted, radial_lens
-from factorlib.images.photo import Photo, box_majority, check_bright, decoded, least_factor, open_photo
+from factorlib.images.lens import Undistortion, radial_lens
+from factorlib.images.photo import Photo, box_majority, check_bright, decode_photo, least_factor, open_photo
 from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
-from factorlib.labels.labels import Labels, read_labels, read_objects
+from factorlib.labels.label_image import Labels, read_labels, read_object_indices
 from factorlib.results.photos import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 
@@ -66,17 +66,17 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
     labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, key)
     object_masks = [(o.name, o.mask) for o in facts.objects]
-    objects = read_objects(object_masks, inputs.file, opened.size, f"{entry}.objects")
+    objects = read_object_indices(object_masks, inputs.file, opened.size, f"{entry}.objects")
     # smallest integer factor at which materials and frame fit their limits
     factor = max(
         least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame)
     )
     factor = min(factor, height, width)
-    labels = reduced(labels, factor, path, key)
+    labels = reduce_labels(labels, factor, path, key)
     objects = box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
-    photo = decoded(opened, facts.encoding, factor, path)
-    photo, labels, objects = undistorted(photo, labels, objects, facts, f"{entry}.camera.distortion")
+    photo = decode_photo(opened, facts.encoding, factor, path)
+    photo, labels, objects = undistort_photo(photo, labels, objects, facts, f"{entry}.camera.distortion")
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
     warn_of_processing(opened.exif, photo, labels, path)
     progress(2, 3, f"{name}: writing")
@@ -116,7 +116,7 @@ def photo_facts(
     )
 
 
-def undistorted(
+def undistort_photo(
     photo: Photo, labels: Labels, objects: np.ndarray, facts: PhotoSlice, key: str
 ) -> tuple[Photo, Labels, np.ndarray]:
     """Remove the distortion that dataset.yaml gives; InputError if it is not invertible within the picture."""
@@ -124,12 +124,12 @@ def undistorted(
     if lens is None:
         return photo, labels, objects
     lens.check(photo.width, photo.height, "dataset.yaml", key)
-    pinhole = Undistorted(lens, photo.height, photo.width)
-    labels = Labels(pinhole.nearest(labels.label), pinhole.nearest(labels.left_out) | ~pinhole.inside)
-    return pinhole.photo(photo), labels, pinhole.nearest(objects)
+    pinhole = Undistortion(lens, photo.height, photo.width)
+    labels = Labels(pinhole.resample_nearest(labels.label), pinhole.resample_nearest(labels.left_out) | ~pinhole.inside)
+    return pinhole.photo(photo), labels, pinhole.resample_nearest(objects)
 
 
-def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
+def reduce_labels(labels: Labels, factor: int, path: Path, key: str) -> Labels:
     """Reduce labels by majority of each box; "left out" counts as a label.
 
     Raises:

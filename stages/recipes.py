@@ -5,7 +5,7 @@ from typing import Annotated
 
 import msgspec
 
-from factorlib.meshes.read import CREASE_DEG
+from factorlib.meshes.read_mesh import CREASE_DEG
 from factorlib.recipe.kinds import recipe_of
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet

@@ -16,12 +16,12 @@ from factorlib.dataset.schema import LightSlice
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
-from factorlib.images.tone import shown
+from factorlib.images.tone import apply_tone
 from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
-from factorlib.render.resynthesis import Reflector, Surroundings, balls, observed_cells, resynthesised
-from factorlib.results.lobe_table import light_of
-from factorlib.results.materials import Gauge, Model, in_order, read_materials
+from factorlib.render.resynthesis import Reflector, Surroundings, observed_cells, render_balls, resynthesise
+from factorlib.results.lobe_table import read_photo_light
+from factorlib.results.materials import Gauge, Model, read_materials, select_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels, read_geometry, with_surface_normals
 from factorlib.urm.observations import read_observations
@@ -52,27 +52,27 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     photo = read_exr(inputs["masks"] / f"{name}.exr")
     geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
     slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
-    light = light_of(inputs["export"], name, slice_)
+    light = read_photo_light(inputs["export"], name, slice_)
     operator = reflection_operator(params.operator, weights=inputs["train"])
     reflector = Reflector(operator, light, model.curvature(slice_.illumination))
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
     total = 10 + len(names)
-    materials = in_order(exported, names, file)
+    materials = select_materials(exported, names, file)
 
     def report(done: float, pixels: float) -> None:
         """Report progress of the re-synthesis, in pixels."""
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
     around = surroundings(inputs, model, exported.gauge)
-    radiance = resynthesised(reflector, materials, photo, geometry, report, around)
+    radiance = resynthesise(reflector, materials, photo, geometry, report, around)
     if tone := model.tone.get(name):
-        radiance = shown(radiance, tone.exponent, tone.pivot)
+        radiance = apply_tone(radiance, tone.exponent, tone.pivot)
     _write(out / "resynthesis" / name, radiance, exposure, ball=False)
     # balls and reflectance maps, material by material
     observed = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
-        shaded, reflectance_map = balls(reflector, material, (params.ball_size, params.map_size))
+        shaded, reflectance_map = render_balls(reflector, material, (params.ball_size, params.map_size))
         _write(out / "materials" / name / label, shaded, exposure, ball=True)
         pixels = observed & (np.rint(photo["label"]) == k)
         cells = observed_cells(np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1), params.map_size)
@@ -93,7 +93,7 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     table = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
     table = with_surface_normals(table, inputs.folders.get("surface"))
     if not model.self_shadowing:
-        table = msgspec.structs.replace(table, visibility=None, met=None)
+        table = msgspec.structs.replace(table, visibility=None, occluder=None)
     bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None
     return Surroundings(table, None if bounced is None else bounced / (gauge.export_factor or 1.0))
 

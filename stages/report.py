@@ -15,7 +15,7 @@ from factorlib.render.solved_set import SolvedSet
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
 from factorlib.report.pictures import exposures, first_pictures, material_tags, photo_row, strip, surface_rows
-from factorlib.report.viewer import viewed
+from factorlib.report.viewer import viewer_data
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
 
@@ -34,18 +34,18 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     tags = material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)
     total = len(run.set.photos) + 4
-    done = count()
+    counter = count()
     for name in run.set.photos:
-        progress(next(done), total, name)
+        progress(next(counter), total, name)
         rows.append(photo_row(run, name, tags, errors.get(name)))
         write_bytes(out / "figures" / "photos" / f"{name}.png", strip(rows[-1]))
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
-    progress(next(done), total, "viewer")
-    viewer = viewed(run, lights, objects, exposures(run))
-    progress(next(done), total, "surfaces")
+    progress(next(counter), total, "viewer")
+    viewer = viewer_data(run, lights, objects, exposures(run))
+    progress(next(counter), total, "surfaces")
     moved = surface_rows(run, objects)
-    progress(next(done), total, "first pictures")
+    progress(next(counter), total, "first pictures")
     first = first_pictures(run, rows, SolvedSet(inputs))
-    progress(next(done), total, "page")
+    progress(next(counter), total, "page")
     write_text(out / "index.html", page(run, rows, tags, viewer, moved, first))

@@ -22,12 +22,12 @@ from factorlib.images.exr import read_exr
 from factorlib.images.tone import srgb_encode
 from factorlib.jsonfile import write_json
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import entry_of
+from factorlib.results.poses import pose_fields
 from factorlib.results.shape_table import FILE, ShapeEntry, ShapesTable
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.motion import PhotoForMotion, RegisteredCamera, cameras_by_motion
-from factorlib.shapes.outline import Outline, Triangles, write_obj
+from factorlib.shapes.outline import Outline, Triangles, write_triangles
 from factorlib.shapes.primitive import primitive
 from factorlib.stage import Inputs, Progress
 
@@ -50,27 +50,27 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     cameras: dict[str, ExternalCamera] = {}
     if slice_.sfm:
         cameras = estimate_cameras(photos, slice_.meshes, lambda share, step: progress(0.5 * share, 1, step))
-    begun = 0.5 if slice_.sfm else 0.0
-    part = (1 - begun) / max(len(slice_.meshes), 1)
+    first_share = 0.5 if slice_.sfm else 0.0
+    part = (1 - first_share) / max(len(slice_.meshes), 1)
     shapes = {}
     (out / "meshes").mkdir()
-    for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):
+    for index, (name, entry) in enumerate(sorted(slice_.meshes.items())):
         outlines = [each for photo in photos.values() for each in photo.outlines(name, entry, cameras.get(photo.name))]
         outlines = [outline for outline in outlines if outline.is_visible]
         try:
-            shape = estimate_shape(entry, outlines, params, _share(begun + part * done, part, name, progress))
+            shape = estimate_shape(entry, outlines, params, _share(first_share + part * index, part, name, progress))
         except InputError as error:
             raise InputError(error.fault, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
-        write_obj(out / "meshes" / f"{name}.obj", shape, parts_of(entry))
+        write_triangles(out / "meshes" / f"{name}.obj", shape, shape_parts(entry))
         extent = tuple(np.ptp(shape.vertices, axis=0).tolist())
         used = sorted({outline.photo for outline in outlines})
-        shapes[name] = ShapeEntry(kind_of(entry), extent, len(shape.faces), used, shape.overlap)
+        shapes[name] = ShapeEntry(shape_kind(entry), extent, len(shape.faces), used, shape.overlap)
         if shape.overlap < GOOD:
             log.warning(
                 "mesh '%s': the %s covers its outlines by %.0f %% only (IoU): check that the object is of that kind "
                 "and that its masks are whole",
                 name,
-                kind_of(entry),
+                shape_kind(entry),
                 100 * shape.overlap,
             )
     write_json(out / FILE, ShapesTable(cameras, shapes))
@@ -100,12 +100,12 @@ def estimate_cameras(
     return {name: photos[name].external(camera, meshes) for name, camera in registered.items()}
 
 
-def kind_of(entry: MeshEntry) -> str:
+def shape_kind(entry: MeshEntry) -> str:
     """Return the kind of a shape: hull, lathe, ball, box or cylinder."""
     return entry.primitive or ("hull" if entry.hull else "lathe")
 
 
-def parts_of(entry: MeshEntry) -> list[str]:
+def shape_parts(entry: MeshEntry) -> list[str]:
     """Return the names of the shape's parts."""
     return list(entry.parts or [ALL_OF_IT])
 
@@ -133,13 +133,13 @@ def estimate_shape(
                 "a hull of %d outlines is larger than the body where no outline limits it: add photos from more sides",
                 len(posed),
             )
-        return visual_hull(posed, params.cells, len(parts_of(entry)), report)
+        return visual_hull(posed, params.cells, len(shape_parts(entry)), report)
     if entry.lathe:
         shape = body_of_revolution(outlines, report)
         is_posed = any(outline.pose is not None for outline in outlines)
         return shape if is_posed else msgspec.structs.replace(shape, vertices=shape.vertices * entry.size)
     assert entry.primitive is not None  # the reader accepts no other mesh without a file
-    return primitive(entry.primitive, outlines, report).of_size(entry.size)
+    return primitive(entry.primitive, outlines, report).with_size(entry.size)
 
 
 class MaskedPhoto:
@@ -174,7 +174,7 @@ class MaskedPhoto:
 
         Hulls are made in the world frame, so cam_from_world is their pose.
         """
-        pose = RigidTransform(**entry_of(registered.pose))
+        pose = RigidTransform(**pose_fields(registered.pose))
         poses = {obj.name: pose for obj in self.entries.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
         return ExternalCamera("sfm", registered.focal * self.facts.factor, None, None, poses)
 
@@ -206,5 +206,5 @@ class MaskedPhoto:
 
     def _labels(self, obj: MeshInstance, entry: MeshEntry) -> list[int]:
         """Return the label of each part of the shape in this photo."""
-        made_of: Mapping[str, str | None] = entry.parts or {ALL_OF_IT: entry.material}
-        return [self.materials.index({**made_of, **obj.materials}[part]) + 1 for part in parts_of(entry)]
+        part_materials: Mapping[str, str | None] = entry.parts or {ALL_OF_IT: entry.material}
+        return [self.materials.index({**part_materials, **obj.materials}[part]) + 1 for part in shape_parts(entry)]

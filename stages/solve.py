@@ -28,7 +28,7 @@ from factorlib.inference.joint_solver import solve
 from factorlib.inference.known import extract_known
 from factorlib.inference.observed import blocks_of_observations, gather_observations, usable_observations
 from factorlib.inference.paper_solver import REPORTS, PaperOptions, Prior, Samplings
-from factorlib.inference.paper_solver import solve as solve_as_the_paper
+from factorlib.inference.paper_solver import solve_paper as solve_as_the_paper
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import (
     InitialFit,
@@ -44,8 +44,8 @@ from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Name
 from factorlib.results.lobe_table import write_lobes
-from factorlib.results.solution import Earlier, read_earlier
-from factorlib.results.surface import BEGINNING
+from factorlib.results.solution import EarlierSolution, read_earlier_solution
+from factorlib.results.surface_table import BEGINNING
 from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
 
@@ -98,16 +98,18 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     _warn(unusable_observations(photos))
     observations = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
     relative = urm.relative_exposures(observations)
-    earlier = read_earlier(inputs["start"]).beside(relative) if "start" in inputs.folders else None
+    earlier = (
+        read_earlier_solution(inputs["start"]).with_relative_exposures(relative) if "start" in inputs.folders else None
+    )
     problem = _build_problem(params, inputs, declared, observations, relative)
     _warn(before_solving(names, observations.photos, problem))
     solution = _run_solver(params, problem, earlier, inputs, partial(_share, progress))
     systems = 2 * len(problem.blocks)
-    made = count(1)
+    counter = count(1)
 
     def tick() -> None:
         """Report that one more system of normal equations for the standard errors is done."""
-        progress(1 - ERRORS + ERRORS * next(made) / systems, 1, "standard errors")
+        progress(1 - ERRORS + ERRORS * next(counter) / systems, 1, "standard errors")
 
     errors, coverages = estimate_uncertainty(solution, problem, params, tick)
     answer = Answer(names, problem, solution, errors, relative, params.solver, earlier)
@@ -196,7 +198,7 @@ def _build_problem(
 
 
 def _run_solver(
-    params: Params, problem: JointProblem, earlier: Earlier | None, inputs: Inputs, progress: Progress
+    params: Params, problem: JointProblem, earlier: EarlierSolution | None, inputs: Inputs, progress: Progress
 ) -> Solution:
     """Return the solution of the chosen solver.
 

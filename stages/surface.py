@@ -23,20 +23,20 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
 from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
 from factorlib.inference.surface_turns import (
-    Attached,
     Detail,
+    SurfacePositions,
     Surfaces,
     attach_pixels,
-    concatenate_attached,
+    concatenate_positions,
     zero_detail,
 )
 from factorlib.jsonfile import write_json
-from factorlib.meshes.read import CREASE_DEG, MeshCache
+from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import BEGINNING, FILE, SurfaceTable, Tried
+from factorlib.results.surface_table import BEGINNING, FILE, DetailEvidence, SurfaceTable
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (
@@ -95,8 +95,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         for values_by_mesh in (displacements, factors)
     ]
     table = SurfaceTable(
-        bool(displacements), Tried.of(result.evidence, result.stiffness.turn),
-        bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,
+        bool(displacements), DetailEvidence.from_decision(result.evidence, result.stiffness.turn),
+        bool(factors), DetailEvidence.from_decision(result.painted, result.stiffness.factor), result.gains, *by_mesh,
     )  # fmt: skip
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
@@ -110,7 +110,7 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
     objects: ObjectsSlice
     poses: PhotoPoses
 
-    def attach(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> Attached:
+    def attach(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> SurfacePositions:
         """Return the positions of pixels (x, y) on the surfaces."""
         height, width = self.geometry["object"].shape
         objects = {entry.name: (entry.mesh, self.poses.objects[entry.name]) for entry in self.objects.objects}
@@ -153,7 +153,7 @@ def read_surfaces(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
     meshes = {}
     for slice_ in slices.values():
         for entry in slice_.objects:
-            if entry.mesh not in meshes and not slice_.meshes[entry.mesh].revolved:
+            if entry.mesh not in meshes and not slice_.meshes[entry.mesh].is_revolved:
                 meshes[entry.mesh] = subdivided_mesh(read.mesh(entry.mesh, slice_.meshes[entry.mesh], entry.materials))
     return Surfaces(dict(sorted(meshes.items())))
 
@@ -169,7 +169,7 @@ def _estimate_surface(
     params: Params,
     inputs: Inputs,
     observations: dict[str, Observations],
-    attached: dict[str, Attached],
+    attached: dict[str, SurfacePositions],
     surfaces: Surfaces,
     progress: Progress,
 ) -> SurfaceEstimate:
@@ -190,18 +190,18 @@ def _estimate_surface(
     merged = concatenate(list(observations.values()))
     merged = at_one_exposure(merged, relative_exposures(merged))
     blocks = blocks_of_observations(merged, Noise(), world_from_camera=worlds, seed=params.seed)
-    in_frame = [light.rotated(worlds.get(name, np.eye(3))) for name, light in attached.items()]
+    in_frame = [light.rotate(worlds.get(name, np.eye(3))) for name, light in attached.items()]
     problem = JointProblem(blocks, reflection_operator("network", weights=inputs["train"]), spread=inputs.map)
-    nodes = concatenate_attached(in_frame)
-    of_blocks = []
+    nodes = concatenate_positions(in_frame)
+    positions = []
     for block in blocks:
         assert block.row is not None  # `blocks_of_observations` numbers the observations
-        of_blocks.append(nodes.take(block.row))
+        positions.append(nodes.take(block.row))
     return estimate_surface(
         problem,
         surfaces,
-        of_blocks,
+        positions,
         start_from_photos(len(inputs.facts["dataset.materials"])),
         params.seed,
-        lambda share, what: progress(share, 1, what),
+        lambda share, activity: progress(share, 1, activity),
     )

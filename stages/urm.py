@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.geometry.visibility import Occluders
+from factorlib.geometry.occlusion import Occluders
 from factorlib.images.exr import read_exr
-from factorlib.meshes.mesh import scaled
-from factorlib.meshes.read import CREASE_DEG, MeshCache
+from factorlib.meshes.mesh import scale_mesh
+from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
@@ -78,5 +78,5 @@ def read_occluders(inputs: Inputs, poses: dict[str, ObjectPose]) -> Occluders:
     read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     entries = [poses[obj.name] for obj in slice_.objects]
     meshes = [read.mesh(obj.mesh, slice_.meshes[obj.mesh], obj.materials) for obj in slice_.objects]
-    scaled_meshes = [scaled(mesh, entry.scale) for mesh, entry in zip(meshes, entries)]
+    scaled_meshes = [scale_mesh(mesh, entry.scale) for mesh, entry in zip(meshes, entries)]
     return Occluders(scaled_meshes, [entry.pose for entry in entries])

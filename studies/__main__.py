@@ -14,11 +14,12 @@ import typer
 from factorlib.__main__ import confirm, raise_on_signals, switched_on
 from factorlib.errors import InputError, did_you_mean
 from factorlib.wholefile import disk_error
-from studies.run import STUDIES, collect, forget, make, studies
+from studies.catalogue import STUDIES
+from studies.run import collect, forget, make, studies
 from studies.study import FULL, QUICK
 
 
-def run(
+def study_command(
     names: Annotated[list[str] | None, typer.Argument(help="studies; all without it; else STUDY")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
     one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
@@ -49,7 +50,7 @@ def run(
 
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-    app.command()(run)
+    app.command()(study_command)
     try:
         with raise_on_signals():
             app(prog_name="python -m studies")

@@ -42,7 +42,7 @@ class MethodPrediction(msgspec.Struct, frozen=True):
     render: Callable[[str | Reflectance, int | Map, SphereView], Radiance | None]
 
 
-def rendered(materials: dict[str, Reflectance], lights: dict[int, Map]) -> MethodPrediction:
+def predict_by_rendering(materials: dict[str, Reflectance], lights: dict[int, Map]) -> MethodPrediction:
     """Predict by the reflectance of each material and the map of each light."""
 
     def render(material: str | Reflectance, light: int | Map, view: SphereView) -> Radiance:
@@ -52,14 +52,14 @@ def rendered(materials: dict[str, Reflectance], lights: dict[int, Map]) -> Metho
     return MethodPrediction(materials, lights, render)
 
 
-def grey(photos: Photos, truths: Materials) -> MethodPrediction:
+def predict_grey(photos: Photos, truths: Materials) -> MethodPrediction:
     """Predict by the photos' mean colours."""
     ball = Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
     lights = {}
     for li in photos.lights:
         colour = np.mean([values.mean(axis=0) for (_, k), values in photos.radiance.items() if k == li], axis=0)
         lights[li] = np.broadcast_to(colour / ALBEDO, (ROWS, 2 * ROWS, 3))
-    return rendered(*in_gauge(dict.fromkeys(photos.materials, ball), lights, truths))
+    return predict_by_rendering(*in_gauge(dict.fromkeys(photos.materials, ball), lights, truths))
 
 
 class Texture:
@@ -80,7 +80,7 @@ class Texture:
         return colours
 
 
-def projective(photos: Photos, truths: Materials) -> MethodPrediction:
+def predict_by_projection(photos: Photos, truths: Materials) -> MethodPrediction:
     """Predict by the photos as textures; a texture knows no light apart from its material."""
     texture = Texture(photos.view)
     radiance = photos.radiance

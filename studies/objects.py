@@ -26,7 +26,7 @@ from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import OctahedralLight, ball
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.meshes.mesh import scaled
+from factorlib.meshes.mesh import scale_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.scenes import bodies
 from factorlib.scenes.joint_problems import observations_from_front
@@ -47,8 +47,8 @@ def body(name: str, triangles: int | None = None) -> Caster:
     parts = [(vertices, faces, 1) for vertices, faces, _ in bodies.SHAPES[name]()]
     if triangles is not None:
         total = sum(len(faces) for _, faces, _ in parts)
-        parts = [bodies.decimated(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
-    return Caster(bodies.mesh_of(parts, name))
+        parts = [bodies.decimate(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
+    return Caster(bodies.mesh_from_parts(parts, name))
 
 
 def observe_objects(
@@ -79,7 +79,7 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Octahedral
     true_pose = Pose(rotation, middle - rotation @ true_mesh.centre)
     true_maps = rasterise(true_mesh, CAMERA, true_pose)
     # the mesh, the pose and the confidence that the solve gets
-    mesh, pose = perturbed(name, true_pose, case.objects, rng)
+    mesh, pose = perturb_pose(name, true_pose, case.objects, rng)
     outline = Silhouette(true_maps.label.astype(np.int16))
     maps = rasterise(mesh, CAMERA, fit_outline(mesh, pose, outline) if case.objects.refined else pose)
     weights = confidence(maps, outline) if case.objects.confidence else np.ones(maps.label.shape)
@@ -96,12 +96,12 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Octahedral
     return photo, angle_deg(true, normals)
 
 
-def perturbed(name: str, truth: Pose, errors: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:
+def perturb_pose(name: str, truth: Pose, errors: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:
     """Return the mesh and the pose that stand for a body whose true pose is `truth`."""
     true_mesh = body(name)
     mesh = body(name, errors.triangles)
     if errors.larger:
-        mesh = Caster(scaled(mesh.mesh, (1 + errors.larger,) * 3))
+        mesh = Caster(scale_mesh(mesh.mesh, (1 + errors.larger,) * 3))
     axis, side = (v / np.linalg.norm(v) for v in (rng.normal(size=3), np.append(rng.normal(size=2), 0.0)))
     rotation = rotation_of_vector(np.radians(errors.turned_deg) * axis) @ truth.rotation
     middle = truth.rotation @ true_mesh.centre + truth.translation + errors.shifted * 2 * true_mesh.radius * side

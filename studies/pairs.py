@@ -32,7 +32,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 from factorlib import load_result
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError
 from factorlib.evaluate.truth import read_true_light
@@ -44,7 +44,7 @@ from factorlib.jsonfile import write_json
 from factorlib.reading import read_text
 from factorlib.recipe.kinds import InsertRecipe
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import GroundSurface, InsertionResult, inserted
+from factorlib.render.insertion import GroundSurface, InsertionResult, insert_object
 from factorlib.render.photo_scene import DistantLight, PlacedMesh
 from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
@@ -163,7 +163,7 @@ def render_pair(
     factor = gauge_factor(recovered.materials, truth.materials)
     scene = scenes[0].scene
     materials = {name: scale_reflectance(m, factor) for name, m in scene.materials.items()}
-    scenes[0] = replace(scenes[0], scene=replace(scene, materials=materials, light=scene.light.scaled(1 / factor)))
+    scenes[0] = replace(scenes[0], scene=replace(scene, materials=materials, light=scene.light.scale(1 / factor)))
     left, top, right, bottom = _window(scenes)
     window = slice(top, bottom), slice(left, right)
 
@@ -173,8 +173,8 @@ def render_pair(
         lit = {"light": scenes[light].scene.light, "materials": scenes[material].scene.materials}
         camera = insertion.scene.camera.window(left, top, 1.0, right - left, bottom - top)
         insertion = replace(insertion, scene=replace(insertion.scene, camera=camera, **lit))
-        background = sets[light].straightened(photo)[window]
-        result = inserted(insertion, background, recovered.covered(photo)[window], recipe.samples, seed=seed)
+        background = sets[light].linear_photo(photo)[window]
+        result = insert_object(insertion, background, recovered.photo_mask(photo)[window], recipe.samples, seed=seed)
         return sets[light].tone(photo)(result.composite), result
 
     (image, result), (true_image, true_result) = trace(False, False, False), trace(True, True, True)
@@ -210,11 +210,11 @@ def score(
         body: Pixels of the object.
     """
     recovered, true, before = (cielab(image) for image in (*pair, photo))
-    changed = (difference(recovered, before) > CHANGED) | (difference(true, before) > CHANGED)
+    changed = (paired_difference(recovered, before) > CHANGED) | (paired_difference(true, before) > CHANGED)
     ground = binary_dilation(body | changed, iterations=2) & ~binary_dilation(body)
 
     def error(image: Image, reference: Image) -> float:
-        errors = difference(cielab(image), reference)
+        errors = paired_difference(cielab(image), reference)
         return float(max(errors[region].mean() for region in (body, ground) if region.any()))
 
     whole = error(pair.recovered, true)
@@ -235,7 +235,7 @@ def cielab(radiance: Image) -> Image:
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
 
 
-def difference(a: Image, b: Image) -> Float[np.ndarray, "h w"]:
+def paired_difference(a: Image, b: Image) -> Float[np.ndarray, "h w"]:
     """Return ΔE (CIE 1976) of each pixel of two pictures in CIELAB."""
     return np.linalg.norm(a - b, axis=-1)
 

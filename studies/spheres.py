@@ -25,13 +25,13 @@ from scipy.spatial.transform import Rotation
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import OctahedralLight, ball, octahedral_light
 from factorlib.generate.surroundings import random_materials
-from factorlib.generate.synthetic import light_of
+from factorlib.generate.synthetic import photo_light
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr
 from factorlib.light.latlong import rotate_map
 from factorlib.results.materials import Reflectance
 from factorlib.scenes.joint_problems import observations_from_front
-from factorlib.tracing.scene import look
+from factorlib.tracing.scene import look_rotation
 from factorlib.urm.observations import Observations
 from studies.study import SEVEN, Case, Comparison, light_name
 
@@ -66,9 +66,9 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Map:
     It is the same however many others there are.
     """
     rng = np.random.default_rng([12, seed, light])
-    world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
+    world_from_camera = look_rotation(rng.uniform(-14, -6), rng.uniform(0, 360))
     lamps = 1 + light % 2 if light else 0  # none: by day
-    radiance = light_of(lamps, world_from_camera, [], rng, rows, spp)
+    radiance = photo_light(lamps, world_from_camera, [], rng, rows, spp)
     return (radiance / radiance.mean()).astype(np.float32)
 
 
@@ -90,19 +90,19 @@ def observe_spheres(
 def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: OctahedralLight) -> Observations:
     entries = [m for m, li in case.entries if li == number]
     labels = [case.materials.index(m) for m in entries]
-    normals = faceted(sphere_view(case.size).normals, case.facets)
+    normals = facet_normals(sphere_view(case.size).normals, case.facets)
     columns = []
     for m, label in zip(entries, labels, strict=True):
         noise, tilt, mislabel = (np.random.default_rng([13, case.seed, number, m, k]) for k in range(3))
         radiance = ball(light, materials[m], normals)
         noisy = radiance * (1 + case.noise * noise.standard_normal(radiance.shape))
-        turned = tilted(normals @ YUP_FROM_CAMERA.T, case.normal_deg, tilt)
-        columns.append((turned, noisy, mislabelled(len(normals), label, labels, case.wrong_labels, mislabel)))
+        turned = tilt_normals(normals @ YUP_FROM_CAMERA.T, case.normal_deg, tilt)
+        columns.append((turned, noisy, mislabel_pixels(len(normals), label, labels, case.wrong_labels, mislabel)))
     photo = map(np.concatenate, zip(*columns, strict=True))
     return observations_from_front(*photo, tuple(case.material_names), light_name(number))
 
 
-def tilted(normals: Normals, degrees: float, rng: np.random.Generator) -> Normals:
+def tilt_normals(normals: Normals, degrees: float, rng: np.random.Generator) -> Normals:
     """Turn each normal by |N(0, degrees)| toward a random side, at most until it is seen at a grazing angle."""
     side = np.cross(normals, rng.normal(size=normals.shape))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
@@ -111,7 +111,7 @@ def tilted(normals: Normals, degrees: float, rng: np.random.Generator) -> Normal
     return np.where((turned @ FRONT > GRAZING)[:, None], turned, normals)
 
 
-def mislabelled(
+def mislabel_pixels(
     n: int, label: int, labels: Sequence[int], share: float, rng: np.random.Generator
 ) -> Int[np.ndarray, " n"]:
     """Return the label of each pixel: for `share` of them another one of `labels`, where there is any."""
@@ -120,20 +120,20 @@ def mislabelled(
     return np.where(wrong, rng.choice(others, n), label) if others else np.full(n, label)
 
 
-def faceted(normals: Normals, facets: int | None) -> Normals:
-    """Return normals of a convex object that shows so many flat faces (`face_normals`).
+def facet_normals(normals: Normals, facets: int | None) -> Normals:
+    """Return normals of a convex object that shows so many flat faces (`polyhedron_normals`).
 
     Each pixel has the normal of the face that is nearest to the sphere's, but for `CURVED` of the way.
     """
     if facets is None:
         return normals
-    faces = face_normals(facets)
+    faces = polyhedron_normals(facets)
     flat = (1 - CURVED) * faces[(normals @ faces.T).argmax(axis=1)] + CURVED * normals
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     return flat[flat[:, 2] > GRAZING]
 
 
-def face_normals(facets: int) -> Float[np.ndarray, "k 3"]:
+def polyhedron_normals(facets: int) -> Float[np.ndarray, "k 3"]:
     """Return normals of faces spread evenly over the cap of n·z > `STEEPEST` about the viewer's z.
 
     One face alone looks straight at the viewer.

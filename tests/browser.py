@@ -93,7 +93,7 @@ def rendered(
 ) -> Float[np.ndarray, "n 3"]:
     """The same by the reflection operator.  light: in a camera's frame;  turn: of the light about the upright axis, radians"""
     c, s = np.cos(turn), np.sin(turn)
-    turned = light.turned(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ YUP_FROM_CAMERA)
+    turned = light.rotate(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ YUP_FROM_CAMERA)
     return Reflector(reflection_operator("network"), turned)(material, normals, views)
 
 

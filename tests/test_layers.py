@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 
-READ = "from factorlib.dataset.read import read_dataset; from factorlib.dataset.slices import SLICES, dataset_slice"
+READ = "from factorlib.dataset.read_dataset import read_dataset; from factorlib.dataset.slices import SLICES, dataset_slice"
 SCIENCE = {"numpy", "torch", "scipy", "OpenImageIO", "PIL"}
 
 

@@ -14,7 +14,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
-from factorlib.pack import pack
+from factorlib.pack import write_pack
 from factorlib.recipe import kinds
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import silent
@@ -102,12 +102,12 @@ def copy(folder, tmp_path):
 
 def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(copy, result, tmp_path):
     home, files = copy / "build" / "set", [tmp_path / f"{k}.zip" for k in range(2)]
-    refusal("report is missing", pack, home, files[0])
+    refusal("report is missing", write_pack, home, files[0])
     (home / "report").mkdir()
     (home / "report" / "index.html").write_text("<html>")
     shutil.move(home / "export", copy / "kept")
     (home / "export").symlink_to(copy / "kept")  # as the runner leaves them
-    counts = [pack(home, file) for file in files]
+    counts = [write_pack(home, file) for file in files]
     assert files[0].read_bytes() == files[1].read_bytes() and counts[0] == counts[1] > 10
     shutil.unpack_archive(files[0], tmp_path / "far")
     shutil.rmtree(copy)
@@ -120,13 +120,13 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
     home, file = copy / "build" / "set", tmp_path / "a.zip"
     (home / "report").mkdir()
     for name, words in (("a.tar", "does not end in .zip"), ("none/a.zip", "does not exist")):
-        refusal(words, pack, home, tmp_path / name)
-    pack(home, file)
+        refusal(words, write_pack, home, tmp_path / name)
+    write_pack(home, file)
     before = file.read_bytes()
-    refusal("FORCE=1", pack, home, file)
+    refusal("FORCE=1", write_pack, home, file)
     monkeypatch.setattr("zipfile.ZipFile.writestr", lambda *_: (_ for _ in ()).throw(OSError("full")))
     with pytest.raises(OSError, match="full"):
-        pack(home, file, replace=True)
+        write_pack(home, file, replace=True)
     assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir() if "zip" in path.name] == ["a.zip"]
 
 

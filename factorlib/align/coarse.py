@@ -204,16 +204,16 @@ def _select_distinct(matches: list[TemplateMatch], keep: int, apart_deg: float) 
     """Select the best matches such that none is within `apart_deg` of a better one."""
     order = np.argsort(np.array([match.error for match in matches]), kind="stable")[: 60 * keep]
     rotations = np.stack([matches[k].roll @ matches[k].turn for k in order])
-    chosen: list[TemplateMatch] = []
+    selected: list[TemplateMatch] = []
     # tr RᵢᵀRⱼ = 1 + 2 cos(angle)
     closest = 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
-    while free.any() and len(chosen) < keep:
+    while free.any() and len(selected) < keep:
         k = int(np.argmax(free))
-        chosen.append(matches[order[k]])
+        selected.append(matches[order[k]])
         free &= np.einsum("nij,ij->n", rotations, rotations[k]) < closest
         free[k] = False
-    return chosen
+    return selected
 
 
 def rotation_to_ray(slope: Float[np.ndarray, "2"]) -> Rotation:

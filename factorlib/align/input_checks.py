@@ -51,14 +51,14 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
             cure="correct the pose, x_cam = R x_object + t with x right, y down, z forward (negate y and z of an "
             "OpenGL camera, which looks along −z), or remove the object from this photo",
         )
-    if behind := int(np.count_nonzero(depth <= 0)):
+    if behind_count := int(np.count_nonzero(depth <= 0)):
         log.warning(
             "%s: %s: its pose (%s) puts %d of its %d vertices behind the camera, as if this stood inside the "
             "object: check the pose, and that its translation is in the mesh's units",
             photo,
             name,
             source,
-            behind,
+            behind_count,
             len(depth),
         )
 

@@ -105,7 +105,7 @@ def align_photo(
     known: KnownFocal,
     photo: str,
     search: SearchOptions = SearchOptions(),
-    report: Report = lambda done: None,
+    report: Report = lambda completed: None,
 ) -> PhotoAlignment:
     """Estimate the poses of all objects of a photo.
 
@@ -128,11 +128,11 @@ def align_photo(
     focal = _initial_focal(objects, known, *prior)
     estimates: dict[int, PoseEstimate] = {}
     searched = [k for k, obj in enumerate(objects) if obj.pose is None]
-    for done, k in enumerate(sorted(searched, key=lambda k: -int(objects[k].silhouette.inside.sum()))):
-        report(done)
+    for completed, k in enumerate(sorted(searched, key=lambda k: -int(objects[k].silhouette.inside.sum()))):
+        report(completed)
         obj = objects[k]
         view = ObjectView(obj.silhouette, focal.camera, focal.prior_sigma)
-        estimates[k] = _estimate_object(obj, view, photo, search, _report_after(done, report))
+        estimates[k] = _estimate_object(obj, view, photo, search, _report_after(completed, report))
         if view.focal_sigma > 0:
             source = "estimated"
             if focal.source == "exif":

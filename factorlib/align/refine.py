@@ -71,7 +71,7 @@ class PoseState(msgspec.Struct, frozen=True):
         """Return the camera `template` with this state's focal length."""
         return msgspec.structs.replace(template, focal=self.focal)
 
-    def moved(self, step: Float[np.ndarray, "7"]) -> "PoseState":
+    def apply_step(self, step: Float[np.ndarray, "7"]) -> "PoseState":
         """Return the state moved by `step`: rotation vector in camera axes (3), a, b, log depth, log focal.
 
         A step of log focal changes depth and slopes as well, so that size and place in the image stay.
@@ -177,7 +177,7 @@ def refine(caster: Caster, target: Target, start: PoseState, steps: int) -> Refi
         scores = [result.score for result in visited]
         if step @ information @ step < STILL**2 or max(scores[-3:]) < max(scores):
             break
-        state = state.moved(step)
+        state = state.apply_step(step)
     return max(visited, key=lambda result: result.score)
 
 

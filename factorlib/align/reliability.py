@@ -117,11 +117,13 @@ def find_doubts(
         scores = f"({mirrored:.3f}, {estimate.score:.3f})"
         fault = f"the mirror image of the mask fits better {scores}: was it mirrored?"
         doubts.append((1 - mirrored < (1 - estimate.score) / 2, fault))
-    if estimate and (other := estimate.runner_up):
-        lead = max(thresholds.least_lead * (1 - other.score), LEAST_SCORE_LEAD)
-        fault = f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well "
-        fault += f"({other.score:.3f}, {estimate.score:.3f})"
-        doubts.append((other.normal_difference_deg > DIFFERENT_DEG and estimate.score - other.score < lead, fault))
+    if estimate and (runner_up := estimate.runner_up):
+        lead = max(thresholds.least_lead * (1 - runner_up.score), LEAST_SCORE_LEAD)
+        fault = f"another pose, its normals {runner_up.normal_difference_deg:.0f}° away, fits as well "
+        fault += f"({runner_up.score:.3f}, {estimate.score:.3f})"
+        doubts.append(
+            (runner_up.normal_difference_deg > DIFFERENT_DEG and estimate.score - runner_up.score < lead, fault)
+        )
     return [reason for is_missed, reason in doubts if is_missed]
 
 
@@ -149,7 +151,7 @@ def measure_reliability(obj: ObjectToAlign, alignment: PhotoAlignment, number: i
     return Reliability(
         contour_error(caster, target, estimate.state),
         normal_stderr_deg(caster, target, estimate.state),
-        estimate_pose(caster, view.mirrored(), QUICK).score if may_be_mirrored else None,
+        estimate_pose(caster, view.mirror(), QUICK).score if may_be_mirrored else None,
     )
 
 
@@ -168,8 +170,8 @@ def contour_error(caster: Caster, target: Target, state: PoseState) -> float:
             distances.append(cKDTree(points).query(region.contour)[0])
         else:
             distances.append(np.full(len(region.contour), target.extent))
-    together = np.concatenate(distances)
-    return float(np.median(together) / target.extent) if len(together) else 1.0
+    all_distances = np.concatenate(distances)
+    return float(np.median(all_distances) / target.extent) if len(all_distances) else 1.0
 
 
 def normal_stderr_deg(caster: Caster, target: Target, state: PoseState) -> float:
@@ -186,7 +188,7 @@ def normal_stderr_deg(caster: Caster, target: Target, state: PoseState) -> float
     precisions, directions = np.linalg.eigh(information[:free, :free])
     for precision, direction in zip(precisions, directions.T, strict=True):
         move = direction * min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
-        moved = state.moved(np.append(move, np.zeros(7 - free)))
+        moved = state.apply_step(np.append(move, np.zeros(7 - free)))
         angles.append(normal_difference(unmoved, render_maps(caster, target, moved)))
     return float(np.sqrt(np.sum(np.square(angles))))
 
@@ -202,7 +204,7 @@ def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
     if not agree.any():
         return np.zeros(agree.shape)
     # distance to contours, jumps and disagreement; slant
-    extent = max(np.ptp(where) for where in np.nonzero(agree)) + 1
+    extent = max(np.ptp(indices) for indices in np.nonzero(agree)) + 1
     distance = distance_transform_edt(np.pad(agree, 1, mode="edge"))[1:-1, 1:-1]
     result = np.clip(distance / max(FULL_DISTANCE * extent, 1.0), 0, 1) * np.clip(maps.edge / FULL_COSINE, 0, 1)
     unsure = (maps.facet / FACET) ** 2 + (normal_spread(maps) / TURN) ** 2  # (1) less 1
@@ -228,12 +230,12 @@ def _depth_jumps(maps: Maps) -> Bool[np.ndarray, "h w"]:
         first = (slice(None),) * axis + (slice(None, -1),)
         second = (slice(None),) * axis + (slice(1, None),)
         # steps of depth larger than the limit and much larger than the neighbouring steps
-        both = mesh[first] & mesh[second]
-        step = np.where(both, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
+        on_mesh = mesh[first] & mesh[second]
+        step = np.where(on_mesh, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
         padded = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in range(2)], constant_values=np.inf)
         before, after = (np.take(padded, range(k, k + step.shape[axis]), axis) for k in (0, 2))
         steep = step > STEEPER * np.minimum(before, after)
-        jump = both & (((step > limit) & steep) | (maps.object[first] != maps.object[second]))
+        jump = on_mesh & (((step > limit) & steep) | (maps.object[first] != maps.object[second]))
         result[first] |= jump
         result[second] |= jump
     return result

@@ -17,7 +17,7 @@ from factorlib.align.refine import PoseState, RefinedState, refine
 from factorlib.align.silhouette import ObjectView, Target, make_target
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, Maps, rasterise
-from factorlib.results.poses import RunnerUpPose, entry_of
+from factorlib.results.poses import RunnerUpPose, pose_fields
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Report = Callable[[float], None]
@@ -107,8 +107,8 @@ def estimate_pose(
     for other in coarser:
         if len(rivals) < search.rivals and _is_apart(other, (ranked[0], *rivals), DISTINCT_DEG):
             rivals.append(other)
-    again = [refine(caster, target, rival.state, search.steps[-1]) for rival in rivals]
-    best, *others = _rank(ranked + again, view)
+    refined = [refine(caster, target, rival.state, search.steps[-1]) for rival in rivals]
+    best, *others = _rank(ranked + refined, view)
     runner_up = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None)
     second = _describe_runner_up(caster, target, best, runner_up) if runner_up else None
     return PoseEstimate(best.state, best.score, best.log_focal_sigma(), second)
@@ -117,7 +117,7 @@ def estimate_pose(
 def _describe_runner_up(caster: Caster, target: Target, best: RefinedState, runner_up: RefinedState) -> RunnerUpPose:
     """Return the pose of the runner-up, its score, and the angle between its normals and those of the best pose."""
     maps = (render_maps(caster, target, result.state) for result in (best, runner_up))
-    pose = entry_of(runner_up.state.pose(caster))
+    pose = pose_fields(runner_up.state.pose(caster))
     return RunnerUpPose(**pose, score=runner_up.score, normal_difference_deg=normal_difference(*maps))
 
 
@@ -192,8 +192,8 @@ def render_maps(caster: Caster, target: Target, state: PoseState) -> Maps:
 
 def normal_difference(a: Maps, b: Maps) -> float:
     """Return the median angle in degrees between the normals of common pixels of the mesh; 180 if there are none."""
-    both = (a.label > 0) & (b.label > 0)
-    if not both.any():
+    overlap = (a.label > 0) & (b.label > 0)
+    if not overlap.any():
         return 180.0
-    cosine = np.clip(np.sum(a.normal[both] * b.normal[both], axis=1), -1, 1)
+    cosine = np.clip(np.sum(a.normal[overlap] * b.normal[overlap], axis=1), -1, 1)
     return float(np.rad2deg(np.median(np.arccos(cosine))))

@@ -52,7 +52,7 @@ def silhouette_of_photo(channels: Channels) -> Silhouette:
     return Silhouette(label)
 
 
-def silhouette_of_object(channels: Channels, number: int, labels: Sequence[int], own_mask: bool) -> Silhouette:
+def silhouette_of_object(channels: Channels, number: int, labels: Sequence[int], has_mask: bool) -> Silhouette:
     """Return the silhouette of one object.
 
     Pixels of other objects and of foreign materials may hide it: they are UNKNOWN.
@@ -61,7 +61,7 @@ def silhouette_of_object(channels: Channels, number: int, labels: Sequence[int],
         channels: Channels that the stage `masks` wrote.
         number: Number of the object in the photo, from 1.
         labels: Labels that the object's mesh carries.
-        own_mask: Whether the object has a mask of its own. If so, it is what lies in that mask; if not, it is every
+        has_mask: Whether the object has a mask of its own. If so, it is what lies in that mask; if not, it is every
             pixel of its materials that no other object claims.
 
     Returns:
@@ -69,7 +69,7 @@ def silhouette_of_object(channels: Channels, number: int, labels: Sequence[int],
     """
     label = silhouette_of_photo(channels).label
     owner = np.round(channels["object"]).astype(int) if "object" in channels else np.zeros(label.shape, int)
-    mine = owner == number if own_mask else np.isin(label, labels) & ((owner == 0) | (owner == number))
+    mine = owner == number if has_mask else np.isin(label, labels) & ((owner == 0) | (owner == number))
     label[~mine & ((label > 0) | ((owner > 0) & (owner != number)))] = UNKNOWN
     return Silhouette(label)
 
@@ -90,8 +90,8 @@ def label_agreement(silhouette: Silhouette, mesh_label: Labels) -> float:
     >>> label_agreement(Silhouette(np.array([[0, 1, 2]])), np.array([[1, 1, 1]]))
     0.5
     """
-    both = silhouette.inside & (mesh_label > 0)
-    return _share(both & (silhouette.label == mesh_label), both)
+    overlap = silhouette.inside & (mesh_label > 0)
+    return _share(overlap & (silhouette.label == mesh_label), overlap)
 
 
 def labelled_iou(silhouette: Silhouette, mesh_label: Labels) -> float:
@@ -125,7 +125,7 @@ class ObjectView(msgspec.Struct, frozen=True):
         """Number of free unknowns of `PoseState.moved`: 7, or 6 if the focal length is known."""
         return 7 if self.focal_sigma > 0 else 6
 
-    def mirrored(self) -> "ObjectView":
+    def mirror(self) -> "ObjectView":
         """Return the view with left and right exchanged."""
         camera = msgspec.structs.replace(
             self.camera, centre=(self.camera.width - self.camera.centre[0], self.camera.centre[1])
@@ -239,9 +239,9 @@ def make_target(view: ObjectView, labels: tuple[int, ...], resolution: int, marg
 def _region(inside: Mask, known: Mask) -> Region:
     """Return the region `inside`, from a window with a border of one pixel around it."""
 
-    def distance_to(where: Mask) -> Float[np.ndarray, "h w"]:
-        """Return the distance of each pixel to the nearest pixel in `where`."""
-        return distance_transform_edt(~where) if where.any() else np.full(where.shape, float(sum(where.shape)))
+    def distance_to(mask: Mask) -> Float[np.ndarray, "h w"]:
+        """Return the distance of each pixel to the nearest pixel in `mask`."""
+        return distance_transform_edt(~mask) if mask.any() else np.full(mask.shape, float(sum(mask.shape)))
 
     # signed distance to the border, 0 on unknown pixels, and its gradient
     distance = np.where(inside, 0.5 - distance_to(~inside), distance_to(inside | ~known) - 0.5)

@@ -50,27 +50,27 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     refuse = Refusal(file, file.parent)
     for index, name in enumerate(spec.materials):
         if name in spec.materials[:index]:
-            with refuse.collecting():
+            with refuse.collect_fault():
                 refuse(
                     f"materials[{index}]",
                     f"material {name!r} is named twice",
                     "label k is the k-th material: name each once",
                 )
     for name, mesh in spec.meshes.items():
-        with refuse.collecting():
+        with refuse.collect_fault():
             _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
             if mesh.hull and spec.cameras is None:
                 _check_hull(name, spec, refuse)
-    with refuse.collecting():
-        refuse.once("photos", (photo.name for photo in spec.photos), "photo")
+    with refuse.collect_fault():
+        refuse.check_distinct("photos", (photo.name for photo in spec.photos), "photo")
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
-    with refuse.collecting():
+    with refuse.collect_fault():
         if spec.cameras is not None:
             _check_source(spec.cameras, spec, refuse)
-    with refuse.collecting():
+    with refuse.collect_fault():
         if spec.truth is not None:
-            refuse.path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
+            refuse.check_path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
     raise_all(refuse.faults)
     _check_known(spec, refuse)  # requires valid objects and meshes
     raise_all(refuse.faults)
@@ -92,25 +92,25 @@ def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -
     photos = {photo.name: photo for photo in spec.photos}
     lights = {photo.light for photo in spec.photos}
     for name in truth.materials:
-        refuse.known(f"materials.{name}", name, spec.materials, "material")
+        refuse.check_known(f"materials.{name}", name, spec.materials, "material")
     for group, known, kind in (("illumination", lights, "illumination"), ("normals", photos, "photo")):
         for name, path in getattr(truth, group).items():
-            refuse.known(f"{group}.{name}", name, known, kind)
-            refuse.path(f"{group}.{name}", path, MAPS, must_exist=False)
+            refuse.check_known(f"{group}.{name}", name, known, kind)
+            refuse.check_path(f"{group}.{name}", path, MAPS, must_exist=False)
     for name, poses in truth.poses.items():
-        refuse.known(f"poses.{name}", name, photos, "photo")
+        refuse.check_known(f"poses.{name}", name, photos, "photo")
         for obj, pose in poses.items():
-            refuse.known(f"poses.{name}.{obj}", obj, [o.name for o in photos[name].objects], "object")
-            refuse.rotation(f"poses.{name}.{obj}.rotation", pose.rotation)
+            refuse.check_known(f"poses.{name}.{obj}", obj, [o.name for o in photos[name].objects], "object")
+            refuse.check_rotation(f"poses.{name}.{obj}.rotation", pose.rotation)
 
 
 def check_lights(photos: list[PhotoEntry], file: Path) -> None:
     """Check that photos that share a light are all fixed to the camera, or all to the world; else InputError."""
     first: dict[str, PhotoEntry] = {}
     for index, photo in enumerate(photos):
-        other = first.setdefault(photo.light, photo)
-        if (other.world_from_camera is None) != (photo.world_from_camera is None):
-            names = f"{other.name!r} and {photo.name!r}"
+        first_photo = first.setdefault(photo.light, photo)
+        if (first_photo.world_from_camera is None) != (photo.world_from_camera is None):
+            names = f"{first_photo.name!r} and {photo.name!r}"
             Refusal(file, file.parent)(
                 f"photos[{index}].world_from_camera",
                 f"photos {names} share illumination {photo.light!r}, but only one of them has this key",
@@ -120,21 +120,21 @@ def check_lights(photos: list[PhotoEntry], file: Path) -> None:
 
 def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
     kinds = [kind for kind in ("file", "hull", "lathe", "primitive") if getattr(mesh, kind)]
-    refuse.when(
+    refuse.refuse_if(
         len(kinds) != 1,
         key,
         f"has {' and '.join(kinds) or 'neither a file nor a shape to be estimated'}",
         "give exactly one of file: <path>, hull: true, lathe: true, primitive: ball | box | cylinder",
     )
     if mesh.file:
-        refuse.path(f"{key}.file", mesh.file, MESHES)
-    refuse.when(
+        refuse.check_path(f"{key}.file", mesh.file, MESHES)
+    refuse.refuse_if(
         mesh.size != 1.0 and kinds[0] in ("file", "hull"),
         f"{key}.size",
         f"cannot be combined with {kinds[0]}",
         "leave it out: the coordinates of the mesh determine its size",
     )
-    refuse.when(
+    refuse.refuse_if(
         mesh.parts and kinds[0] in ("lathe", "primitive"),
         f"{key}.parts",
         f"cannot be combined with {kinds[0]}, which has one part",
@@ -147,14 +147,14 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
     if not mesh.parts and mesh.material is None:
         refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
     if mesh.material is not None:
-        refuse.known(f"{key}.material", mesh.material, materials, "material")
+        refuse.check_known(f"{key}.material", mesh.material, materials, "material")
     _check_parts(f"{key}.parts", mesh.parts or {}, mesh, materials, refuse)
 
 
 def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
     instances = [obj for photo in spec.photos for obj in photo.objects if obj.mesh == name]
     known = sum(obj.pose is not None for obj in instances)
-    refuse.when(
+    refuse.refuse_if(
         known < LEAST_OUTLINES,
         f"meshes.{name}.hull",
         f"{known} of the {len(instances)} photos of it have a known camera; a hull needs at least two",
@@ -166,89 +166,89 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
     """Check the names of parts that are known without opening the mesh, and their materials."""
     file = Path(mesh.file or "")
     for part, material in parts.items():
-        refuse.when(
+        refuse.refuse_if(
             not mesh.file and not mesh.parts and part != ALL_OF_IT,
             f"{key}.{part}",
             f"it has no part {part!r}",
             f"its only part is {ALL_OF_IT!r}",
         )
-        refuse.when(
+        refuse.refuse_if(
             file.suffix.lower() in ONE_PART and part != file.stem,
             f"{key}.{part}",
             f"{file.name} has no part {part!r}",
             f"its only part is {file.stem!r}; for several parts, save the mesh as OBJ or glTF",
         )
         if mesh.parts:
-            refuse.known(f"{key}.{part}", part, mesh.parts, "part")
-        refuse.known(f"{key}.{part}", material, materials, "material")
+            refuse.check_known(f"{key}.{part}", part, mesh.parts, "part")
+        refuse.check_known(f"{key}.{part}", material, materials, "material")
 
 
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
-    with refuse.collecting():
-        refuse.when(
+    with refuse.collect_fault():
+        refuse.refuse_if(
             photo.name in RESERVED_PHOTOS,
             f"{key}.name",
             f"the name {photo.name!r} is reserved for a file of the results",
             "rename the photo",
         )
-    with refuse.collecting():
-        refuse.path(f"{key}.image", photo.image, IMAGES)
-    with refuse.collecting():
+    with refuse.collect_fault():
+        refuse.check_path(f"{key}.image", photo.image, IMAGES)
+    with refuse.collect_fault():
         if photo.world_from_camera is not None:
-            refuse.rotation(f"{key}.world_from_camera", photo.world_from_camera)
-    with refuse.collecting():
+            refuse.check_rotation(f"{key}.world_from_camera", photo.world_from_camera)
+    with refuse.collect_fault():
         if photo.ground is not None:
             _check_ground(f"{key}.ground.normal", photo.ground, refuse)
-    with refuse.collecting():
+    with refuse.collect_fault():
         if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
             refuse(
                 f"{key}.camera.distortion",
                 "its unit is the focal length, which is not given",
                 "give focal_px beside it",
             )
-    with refuse.collecting():
+    with refuse.collect_fault():
         if not photo.masks:
             refuse(f"{key}.masks", "no mask is named", "give a label PNG, a COCO json, or {material: mask.png, …}")
         if isinstance(photo.masks, str):
-            refuse.path(f"{key}.masks", photo.masks, MASKS)
+            refuse.check_path(f"{key}.masks", photo.masks, MASKS)
     for material, path in {} if isinstance(photo.masks, str) else photo.masks.items():
-        with refuse.collecting():
-            refuse.known(f"{key}.masks.{material}", material, spec.materials, "material")
-            refuse.path(f"{key}.masks.{material}", path, (".png",))
-    with refuse.collecting():
-        refuse.when(
+        with refuse.collect_fault():
+            refuse.check_known(f"{key}.masks.{material}", material, spec.materials, "material")
+            refuse.check_path(f"{key}.masks.{material}", path, (".png",))
+    with refuse.collect_fault():
+        refuse.refuse_if(
             not photo.objects,
             f"{key}.objects",
             f"photo {photo.name!r} has no objects",
             "add {name: …, mesh: …}: a mesh gives its pixels their normals",
         )
-        refuse.once(f"{key}.objects", (obj.name for obj in photo.objects), "object")
+        refuse.check_distinct(f"{key}.objects", (obj.name for obj in photo.objects), "object")
     for index, obj in enumerate(photo.objects):
-        with refuse.collecting():
+        with refuse.collect_fault():
             _check_object(f"{key}.objects[{index}]", obj, spec, refuse)
 
 
 def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusal) -> None:
-    refuse.known(f"{key}.mesh", obj.mesh, spec.meshes, "mesh")
+    refuse.check_known(f"{key}.mesh", obj.mesh, spec.meshes, "mesh")
     mesh = spec.meshes[obj.mesh]
     _check_parts(f"{key}.materials", obj.materials, mesh, spec.materials, refuse)
     if obj.mask is not None:
-        refuse.path(f"{key}.mask", obj.mask, (".png",))
+        refuse.check_path(f"{key}.mask", obj.mask, (".png",))
     if obj.pose is not None:
-        refuse.rotation(f"{key}.pose.rotation", obj.pose.rotation)
-        refuse.when(
+        refuse.check_rotation(f"{key}.pose.rotation", obj.pose.rotation)
+        refuse.refuse_if(
             mesh.primitive,
             f"{key}.pose",
             "cannot be given for a primitive, whose size is estimated with its pose",
             "leave it out: the pose is estimated",
         )
-        refuse.when(
+        refuse.refuse_if(
             mesh.lathe and mesh.size != 1.0,
             f"{key}.pose",
             f"cannot be combined with meshes.{obj.mesh}.size: the pose determines the size",
             "keep one of the two",
         )
-    refuse.when(
+    refuse.refuse_if(
         obj.keypoints and not mesh.file,
         f"{key}.keypoints",
         "its mesh has no file, so no points are known on it",
@@ -262,23 +262,23 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
     """Check that known materials occur on objects, and reflect some light but no more than arrives."""
     used = {m for photo in spec.photos for obj in photo.objects for m in instance_materials(obj, spec)}
     for name, reflectance in spec.known.materials.items():
-        with refuse.collecting():
+        with refuse.collect_fault():
             key = f"known.materials.{name}"
-            refuse.known(key, name, spec.materials, "material")
-            refuse.when(
+            refuse.check_known(key, name, spec.materials, "material")
+            refuse.refuse_if(
                 name not in used,
                 key,
                 f"no object is made of material {name!r}",
                 "leave it out, or add the object that shows it",
             )
             specular = reflectance.specular or (0.0, 0.0, 0.0)
-            refuse.when(
+            refuse.refuse_if(
                 not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0,
                 key,
                 "it reflects nothing in some channel, so that the light cannot be derived from it",
                 "give what it reflects in every channel, or leave it out",
             )
-            refuse.when(
+            refuse.refuse_if(
                 max(reflectance.diffuse) + max(specular) > 1,
                 key,
                 f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together",
@@ -296,25 +296,26 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
     for photo in spec.photos:
         shots.setdefault(photo.light, []).append(photo)
     for name in spec.known.exposure:
-        with refuse.collecting():
+        with refuse.collect_fault():
             key = f"known.exposure.{name}"
-            refuse.known(key, name, [photo.name for photo in spec.photos], "photo")
+            refuse.check_known(key, name, [photo.name for photo in spec.photos], "photo")
             sharing = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
             if without := [photo.name for photo in sharing if photo.name not in spec.known.exposure]:
                 refuse(key, f"photo {without[0]!r}, of the same light, has none", "give all of them an EV, or none")
             if len(sharing) == 1:
                 refuse(key, "no other photo shares its light, so its exposure would have no effect", "leave it out")
     for name, light in spec.known.illumination.items():
-        with refuse.collecting():
+        with refuse.collect_fault():
             key = f"known.illumination.{name}"
-            refuse.known(key, name, shots, "illumination")
+            refuse.check_known(key, name, shots, "illumination")
             if isinstance(light, str):
-                refuse.path(key, light, MAPS)
+                refuse.check_path(key, light, MAPS)
                 continue
             key = f"{key}.chrome"
             balls = list(mirror_balls(spec, name, light))
             if not balls:
-                refuse.known(key, light.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object")
+                names = [obj.name for photo in shots[name] for obj in photo.objects]
+                refuse.check_known(key, light.chrome, names, "object")
             photo, ball = balls[0]
             material = min(instance_materials(ball, spec))
             mesh = spec.meshes[ball.mesh]
@@ -359,13 +360,13 @@ def instance_materials(obj: MeshInstance, spec: DatasetFile) -> set[str]:
 
 
 def _check_ground(key: str, ground: GroundEntry, refuse: Refusal) -> None:
-    refuse.when(
+    refuse.refuse_if(
         not any(ground.normal),
         key,
         "the normal has length 0",
         "write the direction that points up from the ground, in the camera's axes",
     )
-    refuse.when(
+    refuse.refuse_if(
         sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0,
         key,
         "it points away from the camera, or the camera lies in the plane",
@@ -381,7 +382,7 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
             "has both a pose and keypoints",
             "keep one: a pose is used as it is, keypoints are where the search begins",
         )
-    refuse.when(
+    refuse.refuse_if(
         len(obj.keypoints) < LEAST_KEYPOINTS,
         key,
         f"{len(obj.keypoints)} keypoints do not determine a pose",
@@ -391,15 +392,15 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         places = [getattr(keypoint, name) for keypoint in obj.keypoints]
         first: dict[tuple[float, ...], int] = {}
         for index, place in enumerate(places):
-            if (other := first.setdefault(place, index)) != index:
-                refuse(f"{key}[{index}].{name}", f"equals that of {key}[{other}]", "name each place once")
+            if (first_index := first.setdefault(place, index)) != index:
+                refuse(f"{key}[{index}].{name}", f"equals that of {key}[{first_index}]", "name each place once")
         # largest distance of a place from the line through the first and the farthest one
         arms = [[x - x0 for x, x0 in zip(place, places[0])] for place in places[1:]]
         longest = max(arms, key=lambda arm: math.hypot(*arm))
         unit = [x / math.hypot(*longest) for x in longest]
         along = [sum(x * u for x, u in zip(arm, unit)) for arm in arms]
         distances = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
-        refuse.when(
+        refuse.refuse_if(
             max(distances) < LEAST_OFF_LINE * math.hypot(*longest),
             key,
             f"all {name}s lie on one line",
@@ -410,7 +411,7 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
     """Check that there is one source of cameras, with a path inside the folder and known names."""
     kinds = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
-    refuse.when(
+    refuse.refuse_if(
         len(kinds) != 1,
         "cameras",
         f"names {' and '.join(kinds) or 'no source'}",
@@ -419,21 +420,21 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
     kind = kinds[0]
     excluded, reason = EXCLUDED[kind]
     for key in excluded:
-        refuse.when(
+        refuse.refuse_if(
             getattr(source, key) != getattr(CameraSource(), key),
             f"cameras.{key}",
             f"cannot be combined with {kind}: {reason}",
             "leave it out",
         )
     if kind == "transforms":
-        refuse.path("cameras.transforms", source.transforms or "", (".json",))
+        refuse.check_path("cameras.transforms", source.transforms or "", (".json",))
     elif kind != "sfm":
-        refuse.subfolder(f"cameras.{kind}", getattr(source, kind))
+        refuse.check_subfolder(f"cameras.{kind}", getattr(source, kind))
     photos = [photo.name for photo in spec.photos]
     objects = {obj.name for photo in spec.photos for obj in photo.objects}
     keys = {"images": (photos, "photo"), "world_from_object": (objects, "object"), "obj_ids": (spec.meshes, "mesh")}
     for key, (known, noun) in keys.items():
         for name in getattr(source, key):
-            refuse.known(f"cameras.{key}.{name}", name, known, noun)
+            refuse.check_known(f"cameras.{key}.{name}", name, known, noun)
     for name, similarity in source.world_from_object.items():
-        refuse.rotation(f"cameras.world_from_object.{name}.rotation", similarity.rotation)
+        refuse.check_rotation(f"cameras.world_from_object.{name}.rotation", similarity.rotation)

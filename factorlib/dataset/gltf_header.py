@@ -127,7 +127,7 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
         InputError: The file is not glTF 2.0, or its meshes are compressed.
     """
 
-    def refused(fault: str, cure: str) -> InputError:
+    def refusal(fault: str, cure: str) -> InputError:
         """Return an InputError about the file."""
         return InputError(fault, file=file, key=key, cure=cure)
 
@@ -142,16 +142,16 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
                 raise ValueError("its first chunk is longer than the file")
         text = stream.read(size if length is None else length)
         if text.count(b",") > MOST_VALUES:
-            raise refused(
+            raise refusal(
                 f"its header has more than {MOST_VALUES:,} values",
                 "export the geometry alone, with its data in a .bin file or as .glb",
             )
         header = msgspec.json.decode(text, type=GltfHeader)
     if header.asset.version.split(".")[0] != "2":
-        raise refused(f"is glTF {header.asset.version[:20]}", "export it again, as glTF 2.0")
+        raise refusal(f"is glTF {header.asset.version[:20]}", "export it again, as glTF 2.0")
     for name in COMPRESSED:
         if name in header.extensionsRequired:
-            raise refused(f"its meshes are compressed ({name})", "export it without compression")
+            raise refusal(f"its meshes are compressed ({name})", "export it without compression")
     return header
 
 

@@ -34,7 +34,7 @@ class Refusal:
         """Raise InputError for a key, with a fault and its cure."""
         raise InputError(fault, file=self.file, key=key, cure=cure)
 
-    def when(self, condition: object, key: str, fault: str, cure: str) -> None:
+    def refuse_if(self, condition: object, key: str, fault: str, cure: str) -> None:
         """Raise InputError for a key if a condition is true.
 
         Args:
@@ -47,14 +47,14 @@ class Refusal:
             self(key, fault, cure)
 
     @contextmanager
-    def collecting(self) -> Iterator[None]:
+    def collect_fault(self) -> Iterator[None]:
         """Catch an InputError of the code inside and add it to `faults`, so that checking continues."""
         try:
             yield
         except InputError as error:
             self.faults.append(error)
 
-    def known(self, key: str, name: str, known: Iterable[str], kind: str) -> None:
+    def check_known(self, key: str, name: str, known: Iterable[str], kind: str) -> None:
         """Check that a name is among the known ones; the error suggests the nearest one.
 
         Args:
@@ -70,7 +70,7 @@ class Refusal:
                 (did_you_mean(name, known) if known else f"the dataset has no {kind} here"),
             )
 
-    def once(self, key: str, names: Iterable[str], kind: str) -> None:
+    def check_distinct(self, key: str, names: Iterable[str], kind: str) -> None:
         """Check that the names of a list are distinct.
 
         Args:
@@ -80,32 +80,32 @@ class Refusal:
         """
         first: dict[str, int] = {}
         for index, name in enumerate(names):
-            self.when(
+            self.refuse_if(
                 first.setdefault(name, index) != index,
                 f"{key}[{index}].name",
                 f"duplicate {kind} name {name!r}",
                 f"{key}[{first[name]}] has it already: rename one",
             )
 
-    def rotation(self, key: str, rows: tuple) -> None:
+    def check_rotation(self, key: str, rows: tuple) -> None:
         """Check that three rows are a rotation: RᵀR = 1 within ROTATION_TOLERANCE, determinant +1."""
         gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
         worst = max(abs(entry) for row in gram for entry in row)
-        self.when(
+        self.refuse_if(
             not worst <= ROTATION_TOLERANCE,
             key,
             f"not a rotation: RᵀR differs from 1 by {worst:.3g}",
             "its columns must be unit vectors at right angles (no scale)",
         )
         a, b, c = rows
-        self.when(
+        self.refuse_if(
             sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3)) < 0,
             key,
             "not a rotation but a reflection (determinant −1)",
             "one axis is flipped: the camera frame is x right, y down, z forward",
         )
 
-    def path(self, key: str, path: str, suffixes: Iterable[str], must_exist: bool = True) -> None:
+    def check_path(self, key: str, path: str, suffixes: Iterable[str], must_exist: bool = True) -> None:
         """Check that a path has a known suffix and leads to a plain, readable file inside the folder.
 
         Args:
@@ -114,15 +114,15 @@ class Refusal:
             suffixes: the known suffixes
             must_exist: require that the file exists
         """
-        target = self._followed(key, path, "file")
-        self.when(
+        target = self._resolve(key, path, "file")
+        self.refuse_if(
             target.suffix.lower() not in suffixes,
             key,
             f"{path!r} has a suffix that is not read here",
             f"expected one of {', '.join(suffixes)}",
         )
         if file_exists(target, key):
-            self._plain(key, path, target)
+            self._check_plain(key, path, target)
         elif must_exist:
             try:
                 names = [entry.name for entry in target.parent.iterdir() if entry.is_file()]
@@ -135,11 +135,13 @@ class Refusal:
                 (suggestion if suggestion.startswith("did") else f"put it at {target}, or correct the path"),
             )
 
-    def subfolder(self, key: str, path: str) -> None:
+    def check_subfolder(self, key: str, path: str) -> None:
         """Check that a path leads to a readable folder inside the dataset's, with links followed."""
-        folder = self._followed(key, path, "folder")
+        folder = self._resolve(key, path, "folder")
         with reading("a folder", self.file, key):
-            self.when(not folder.is_dir(), key, f"there is no folder {path!r}", "copy it there, or correct the path")
+            self.refuse_if(
+                not folder.is_dir(), key, f"there is no folder {path!r}", "copy it there, or correct the path"
+            )
             os.scandir(folder).close()
 
     def file_in(self, key: str, folder: str, name: str) -> Path | None:
@@ -150,19 +152,19 @@ class Refusal:
             folder: the folder
             name: name of the file, which may not lead outside either
         """
-        target = self._followed(key, f"{folder}/{name}", "file")
+        target = self._resolve(key, f"{folder}/{name}", "file")
         if not file_exists(target, key):
             return None
-        self._plain(key, f"{folder}/{name}", target)
+        self._check_plain(key, f"{folder}/{name}", target)
         return target
 
-    def _plain(self, key: str, path: str, target: Path) -> None:
+    def _check_plain(self, key: str, path: str, target: Path) -> None:
         try:
             check_plain(target, "a file", key, most_bytes=None)
         except InputError as error:
             self(key, f"{path!r} {error.fault}", error.cure or "correct the path")
 
-    def _followed(self, key: str, path: str, kind: str) -> Path:
+    def _resolve(self, key: str, path: str, kind: str) -> Path:
         """Return the path with links followed, which must stay in the folder.
 
         A folder with plain files is resolved once, because a set may have thousands of them.

@@ -76,7 +76,7 @@ class MeshEntry(_Format, frozen=True):
         return self.parts or self.material
 
     @property
-    def revolved(self) -> bool:
+    def is_revolved(self) -> bool:
         """True for a shape that is symmetric about its axis, so that its rotation about it is not observable."""
         return self.lathe or self.primitive in ("ball", "cylinder")
 

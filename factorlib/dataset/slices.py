@@ -52,11 +52,11 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Data
     elif name in _PHOTO_SLICES:
         names = [photo] if photo is not None else [entry.name for entry in dataset.spec.photos]
         slices = {each: _PHOTO_SLICES[name](dataset, dataset.photo(each)) for each in names}
-        files = [file for _, own in slices.values() for file in own]
-        facts = {each: _json_able(own) for each, (own, _) in slices.items()}
-        for each, own in facts.items():
+        files = [file for _, photo_files in slices.values() for file in photo_files]
+        facts = {each: _json_able(photo_facts) for each, (photo_facts, _) in slices.items()}
+        for each, photo_facts in facts.items():
             places = {"focal_px": f"photos.{each}.camera.focal_px", "meshes": "meshes", "external": f"cameras.{each}"}
-            for key, value in own.items():
+            for key, value in photo_facts.items():
                 fields |= _fields(value, places.get(key, f"photos.{each}.{key}"))
         facts = facts if photo is None else facts[photo]
     else:

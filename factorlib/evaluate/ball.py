@@ -79,7 +79,7 @@ def _octahedral_texels(height: int, width: int) -> Int[np.ndarray, " hw"]:
     return np.ravel_multi_index(_texel(lat_long_directions(height, width).reshape(-1, 3)), (SIDE, SIDE))
 
 
-def constant_light(colour: Float[np.ndarray, "3"]) -> OctahedralLight:
+def uniform_light(colour: Float[np.ndarray, "3"]) -> OctahedralLight:
     """Return a light of the same radiance from every direction."""
     return OctahedralLight(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
 
@@ -116,7 +116,7 @@ def texel_weights(
 def diffuse_lobe(normals: Float[np.ndarray, "n 3"]) -> Reflected:
     """Return a function of a light: the radiance E(n)/π of a white Lambertian surface at each normal."""
     cosine = np.maximum(normals.astype(np.float32) @ octahedral_directions(WIDE_SIDE).T.astype(np.float32), 0)
-    return partial(_summed, cosine / np.float32(np.pi))
+    return partial(_integrate, cosine / np.float32(np.pi))
 
 
 def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> Reflected:
@@ -136,7 +136,7 @@ def _wide_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> Reflected:
     cos_o = np.maximum(normals @ VIEW, 1e-3).astype(np.float32)[:, None]
     cos_i, cos_h = (normals.astype(np.float32) @ d.T.astype(np.float32) for d in (directions, half))
     shadowing = _g1(np.maximum(cos_i, 1e-6), alpha) * _g1(cos_o, alpha)
-    return partial(_summed, np.where(cos_i > 0, _ggx(cos_h, alpha) * shadowing / (4 * cos_o), 0))
+    return partial(_integrate, np.where(cos_i > 0, _ggx(cos_h, alpha) * shadowing / (4 * cos_o), 0))
 
 
 def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> Reflected:
@@ -183,7 +183,7 @@ def ball(light: OctahedralLight, material: Reflectance, normals: Float[np.ndarra
     return value + specular * glossy_lobe(normals, material.roughness)(light) if specular.any() else value
 
 
-def _summed(response: Float[np.ndarray, "n t"], light: OctahedralLight) -> Float[np.ndarray, "n 3"]:
+def _integrate(response: Float[np.ndarray, "n t"], light: OctahedralLight) -> Float[np.ndarray, "n 3"]:
     """Return ∫ L · response over the texels of the level of `WIDE_SIDE`."""
     return response @ light.wide.astype(response.dtype) * (4 * np.pi / WIDE_SIDE**2)
 

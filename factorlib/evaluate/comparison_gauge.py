@@ -78,16 +78,16 @@ def _ratio(cross: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
     return np.where(square > 0, cross / np.where(square > 0, square, 1.0), 1.0)
 
 
-def connected_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
+def material_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
     """Return the connected component of each material, given the materials observed in each light.
 
     A light links the materials observed in it.  Components are numbered by their first material's name.
 
-    >>> connected_components({"day": ["red", "white"], "night": ["blue"]})
+    >>> material_components({"day": ["red", "white"], "night": ["blue"]})
     {'blue': 0, 'red': 1, 'white': 1}
     """
-    names = sorted({name for together in pairs.values() for name in together})
-    linked = [(names.index(together[0]), names.index(name)) for together in pairs.values() for name in together]
+    names = sorted({name for members in pairs.values() for name in members})
+    linked = [(names.index(members[0]), names.index(name)) for members in pairs.values() for name in members]
     first, second = np.array(linked, dtype=int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(linked)), (first, second)), shape=(len(names), len(names)))
     _, label = components_of_graph(graph, directed=False)

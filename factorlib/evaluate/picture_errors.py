@@ -26,7 +26,14 @@ from scipy.ndimage import correlate1d, find_objects
 
 from factorlib.evaluate.comparison_gauge import GAUGES, gauge_factors
 from factorlib.results.materials import vec3
-from factorlib.results.metrics import LightError, PhotoErrors, PictureError, ResynthesisErrors, Scored, ScoredPicture
+from factorlib.results.metrics import (
+    ErrorWithNull,
+    LightError,
+    PhotoErrors,
+    PictureError,
+    ResynthesisErrors,
+    ScoredPicture,
+)
 from factorlib.urm.extract import observed_pixels
 
 Picture = Float[np.ndarray, "h w 3"]
@@ -39,7 +46,7 @@ WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 WINDOW = WINDOW / WINDOW.sum()
 
 
-def white_of(truth: Picture, mask: Mask) -> float:
+def white_level(truth: Picture, mask: Mask) -> float:
     """Return the radiance that the tone map shows as white; 1 for a picture that is black or empty."""
     if not mask.any():
         return 1.0
@@ -47,10 +54,10 @@ def white_of(truth: Picture, mask: Mask) -> float:
     return white if white > 0 else 1.0
 
 
-def tone_mapped(radiance: Float[np.ndarray, "*s 3"], exposure: float) -> Float[np.ndarray, "*s 3"]:
+def tone_map(radiance: Float[np.ndarray, "*s 3"], exposure: float) -> Float[np.ndarray, "*s 3"]:
     """Return display values in [0, 1].
 
-    >>> float(tone_mapped(np.array([0.25, 1.0, 9.0]), 2.0)[0].round(3))
+    >>> float(tone_map(np.array([0.25, 1.0, 9.0]), 2.0)[0].round(3))
     0.73
     """
     return np.clip(radiance * exposure, 0.0, 1.0) ** (1 / 2.2)
@@ -80,11 +87,11 @@ def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
         mask: pixels to compare
     """
     inside = mask[..., None].astype(np.float32)
-    total = np.maximum(_blurred(inside), 1e-12)
+    total = np.maximum(_blur(inside), 1e-12)
 
     def mean(values: np.ndarray) -> np.ndarray:
         """Return Gaussian-weighted local means over the mask."""
-        return _blurred(values * inside) / total
+        return _blur(values * inside) / total
 
     # SSIM = (2 μa μb + C1)(2 cov + C2) / ((μa² + μb² + C1)(var a + var b + C2)), from local moments
     a = a.astype(np.float32)
@@ -119,14 +126,14 @@ def picture_errors(
     estimate = estimate[box]
     truth = truth[box]
     union = union[box]
-    shown = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
-    ssim = ssim_map(shown[0], shown[1], union)
+    displayed = [tone_map(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
+    ssim = ssim_map(displayed[0], displayed[1], union)
 
     def error(region: Mask) -> PictureError:
         """Return the errors inside one region."""
         psnr_linear = psnr(estimate[region], truth[region], white)
         dssim = round(float(np.clip((1 - ssim[region].mean()) / 2, 0, 1)), 9)
-        return PictureError(psnr_linear, psnr(shown[0][region], shown[1][region], 1.0), dssim)
+        return PictureError(psnr_linear, psnr(displayed[0][region], displayed[1][region], 1.0), dssim)
 
     return {name: error(region[box]) for name, region in regions.items()}
 
@@ -149,12 +156,14 @@ def mean_error(errors: Sequence[Error], digits: int = 6) -> Error:
     return type(errors[0])(*(round(float(np.mean(column)), digits) for column in values.T))
 
 
-def mean_scored(scored: Sequence[Scored[Error]], digits: int = 6) -> Scored[Error]:
+def mean_error_with_null(scored: Sequence[ErrorWithNull[Error]], digits: int = 6) -> ErrorWithNull[Error]:
     """Return the mean of estimates and the mean of nulls, each by `mean_error`."""
-    return Scored(*(mean_error([getattr(each, part) for each in scored], digits) for part in ("estimate", "null")))
+    return ErrorWithNull(
+        *(mean_error([getattr(each, part) for each in scored], digits) for part in ("estimate", "null"))
+    )
 
 
-def _blurred(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+def _blur(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
     for axis in (0, 1):
         values = correlate1d(values, WINDOW, axis=axis, mode="constant")
     return values
@@ -183,7 +192,7 @@ class ComparedPhoto(msgspec.Struct, frozen=True):
     clipped_satisfied: float | None
 
 
-def compared_photo(photo: Channels, geometry: Channels, resynthesis: Picture) -> ComparedPhoto:
+def combine_photo(photo: Channels, geometry: Channels, resynthesis: Picture) -> ComparedPhoto:
     """Return a photo with its re-synthesis, the mask of the pixels that count, and the numbers of the others.
 
     Args:
@@ -212,7 +221,7 @@ def compared_photo(photo: Channels, geometry: Channels, resynthesis: Picture) ->
         resynthesis,
         label,
         pixels,
-        white_of(rgb, pixels),
+        white_level(rgb, pixels),
         {k: int(v.sum()) for k, v in counts.items()},
         float(satisfied.mean()) if bounds.any() else None,
     )
@@ -247,7 +256,7 @@ def compare_photos(
     scored = [p.gauges for p in photos.values() if p.gauges]
     if not scored:
         return ResynthesisErrors(photos, None, None, None)
-    mean = {g: mean_scored([s[g] for s in scored]) for g in GAUGES}
+    mean = {g: mean_error_with_null([s[g] for s in scored]) for g in GAUGES}
     worst = [min(getattr(s["none"].estimate, f"psnr_{kind}_db") for s in scored) for kind in ("linear", "tonemapped")]
     return ResynthesisErrors(photos, mean, *worst)
 
@@ -257,8 +266,8 @@ def _photo_errors(photo: ComparedPhoto, materials: list[str], factor: dict[str, 
     flat = np.zeros_like(photo.photo)  # the null
     for region in (region for region in regions.values() if region.any()):
         flat[region] = photo.photo[region].mean(axis=0)
-    null = _scored(flat, photo, regions)
-    errors = {g: _scored(photo.resynthesis * factor[g], photo, regions) for g in GAUGES}
+    null = _score_with_null(flat, photo, regions)
+    errors = {g: _score_with_null(photo.resynthesis * factor[g], photo, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:
         """Return the scores of a region in each gauge."""
@@ -274,6 +283,6 @@ def _photo_errors(photo: ComparedPhoto, materials: list[str], factor: dict[str, 
     )
 
 
-def _scored(estimate: Picture, photo: ComparedPhoto, regions: dict) -> dict[str, PictureError]:
+def _score_with_null(estimate: Picture, photo: ComparedPhoto, regions: dict) -> dict[str, PictureError]:
     estimate = np.nan_to_num(estimate, posinf=0.0, neginf=0.0)
     return picture_errors(estimate, photo.photo, {"": photo.pixels, **regions}, photo.white)

@@ -45,14 +45,21 @@ from factorlib.evaluate.ball import (
     WIDE_SIDE,
     OctahedralLight,
     Reflected,
-    constant_light,
     diffuse_lobe,
     glossy_lobe,
     mirror_ball,
     octahedral_directions,
+    uniform_light,
 )
 from factorlib.evaluate.comparison_gauge import GAUGES, Samples, errors_by_gauge
-from factorlib.evaluate.picture_errors import mean_error, mean_scored, picture_error, psnr, tone_mapped, white_of
+from factorlib.evaluate.picture_errors import (
+    mean_error,
+    mean_error_with_null,
+    picture_error,
+    psnr,
+    tone_map,
+    white_level,
+)
 from factorlib.evaluate.truth import angles_deg
 from factorlib.geometry.sphere import ball_normals, mirror_directions
 from factorlib.results.materials import Reflectance, Vec3, vec3
@@ -74,7 +81,7 @@ MEAN_SHOWN = 0.5  # mean of the true ball in the relit set score, linear, before
 
 
 @lru_cache(maxsize=17)
-def lobe_of(roughness: float | None) -> Reflected:
+def ball_lobe(roughness: float | None) -> Reflected:
     """Return the glossy lobe of a ball of some roughness, or the diffuse lobe for None.
 
     Lobes are cached, up to 200 MB, because materials appear in many lights.
@@ -86,8 +93,8 @@ class Appearances:
     """Balls of many materials in one light; each part of the reflection is rendered once."""
 
     def __init__(self, light: OctahedralLight):
-        self.diffuse = lobe_of(None)(light)
-        self.glossy = cache(lambda roughness: lobe_of(roughness)(light))
+        self.diffuse = ball_lobe(None)(light)
+        self.glossy = cache(lambda roughness: ball_lobe(roughness)(light))
 
     def ball(self, material: Reflectance) -> Samples:
         """Return the radiance of a ball of `material`, one row per normal, RGB."""
@@ -108,7 +115,7 @@ def compare_relighting(
     truths: Mapping[str, Reflectance],
     estimated_lights: Mapping[str, OctahedralLight],
     true_lights: Mapping[str, OctahedralLight],
-    seen: Mapping[str, Sequence[str]],
+    observed: Mapping[str, Sequence[str]],
 ) -> Relighting | None:
     """Compare every material with a truth in every light with a truth; None if there is no such pair.
 
@@ -117,7 +124,7 @@ def compare_relighting(
         truths: true materials by name
         estimated_lights: recovered lights by name
         true_lights: true lights by name
-        seen: the materials observed in each light
+        observed: the materials observed in each light
     """
     pairs = [(li, m) for li in true_lights if li in estimated_lights for m in truths if m in estimates]
     if not pairs:
@@ -130,21 +137,21 @@ def compare_relighting(
         "null_grey": [GREY * lit[li][0].diffuse for li, _ in pairs],
         "null_mean_colour": [np.broadcast_to(t.mean(axis=0), t.shape) for t in true],
     }
-    whites = [white_of(t[None], np.ones((1, len(t)), bool)) for t in true]
+    whites = [white_level(t[None], np.ones((1, len(t)), bool)) for t in true]
 
     def error(ball: Samples, i: int) -> PictureError:
         """Return the error of a scaled ball against the true one."""
-        return picture_error(disc(ball), disc(true[i]), INSIDE, whites[i])
+        return picture_error(ball_picture(ball), ball_picture(true[i]), INSIDE, whites[i])
 
     balls: dict[str, dict[str, RelitBall]] = {}
     for (li, m), white, errors in zip(pairs, whites, errors_by_gauge(kinds, true, whites, error, below_white=True)):
-        balls.setdefault(li, {})[m] = RelitBall(m in seen.get(li, ()), 1 / white, errors)
+        balls.setdefault(li, {})[m] = RelitBall(m in observed.get(li, ()), 1 / white, errors)
     every = [b for row in balls.values() for b in row.values()]
     hidden = [b for b in every if not b.observed]
     return Relighting(balls, _mean(every), _mean(hidden) if hidden else None)
 
 
-def disc(samples: Samples) -> Float[np.ndarray, "h w 3"]:
+def ball_picture(samples: Samples) -> Float[np.ndarray, "h w 3"]:
     """Return the picture of a ball, black around it."""
     picture = np.zeros((*INSIDE.shape, 3))
     picture[INSIDE] = samples
@@ -177,8 +184,8 @@ def compare_relit_set(
     nulls = []
     for m, light in ((m, light) for light in true_lights if light in estimated_lights for m in names):
         ball = appearances(true_lights[light]).ball(truths[m])
-        scores[m, light] = shown_psnr(appearances(estimated_lights[light]).ball(estimates[m]), ball)
-        nulls.append(shown_psnr(np.broadcast_to(ball.mean(axis=0), ball.shape), ball))
+        scores[m, light] = displayed_psnr(appearances(estimated_lights[light]).ball(estimates[m]), ball)
+        nulls.append(displayed_psnr(np.broadcast_to(ball.mean(axis=0), ball.shape), ball))
     if not scores:
         return None
     worst = min(scores, key=scores.__getitem__)
@@ -194,17 +201,17 @@ def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
     >>> set_factor([(Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3), true)])
     (2.0, 1.0, 1.0)
     """
-    both = np.array([[(m.diffuse, m.specular) for m in pair] for pair in pairs], float)
-    recovered, true = (both[:, k].reshape(-1, 3).T for k in (0, 1))
+    parameters = np.array([[(m.diffuse, m.specular) for m in pair] for pair in pairs], float)
+    recovered, true = (parameters[:, k].reshape(-1, 3).T for k in (0, 1))
     logs = [np.log(t[k]) - np.log(r[k]) for r, t in zip(recovered, true) for k in [(r > 0) & (t > 0)]]
     return vec3(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)
 
 
-def shown_psnr(recovered: Samples, true: Samples) -> float:
+def displayed_psnr(recovered: Samples, true: Samples) -> float:
     """Return the PSNR in dB of two balls at the exposure of the true one, or at exposure 1 if that is black."""
     mean = float(np.mean(true, dtype=float))
     exposure = MEAN_SHOWN / mean if mean > np.finfo(np.float32).tiny else 1.0
-    return psnr(tone_mapped(recovered, exposure), tone_mapped(true, exposure), 1.0)
+    return psnr(tone_map(recovered, exposure), tone_map(true, exposure), 1.0)
 
 
 GLOSSY_ROUGHNESS = 0.4
@@ -267,7 +274,7 @@ def compare_lights(
     mean = {}
     for gauge in GAUGES:
         by_view = {v: [lights[n][gauge][v] for n in names if v in lights[n][gauge]] for v in VIEWS}
-        mean[gauge] = {v: mean_scored(scores, 9) for v, scores in by_view.items() if scores}
+        mean[gauge] = {v: mean_error_with_null(scores, 9) for v, scores in by_view.items() if scores}
     fraction = {n: float(np.mean(hits[n])) if n in hits else None for n in names}
     return LightErrors(lights, mean, fraction)
 
@@ -293,7 +300,7 @@ def mirrored_directions(
 
 def sphere_row(light: OctahedralLight) -> Float[np.ndarray, "s w 3"]:
     """Render the three spheres side by side, black around them."""
-    return np.concatenate([disc(VIEWS[name](light)) for name in SPHERES], axis=1)
+    return np.concatenate([ball_picture(VIEWS[name](light)) for name in SPHERES], axis=1)
 
 
 def _texels_of_octahedron(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
@@ -312,7 +319,7 @@ def _scored_view(
     true = [render(truths[n])[part].reshape(-1, 3) for n, part in samples.items()]
     kinds = {
         "estimate": [render(estimates[n])[part].reshape(-1, 3) for n, part in samples.items()],
-        "null": [render(constant_light(truths[n].mean))[part].reshape(-1, 3) for n, part in samples.items()],
+        "null": [render(uniform_light(truths[n].mean))[part].reshape(-1, 3) for n, part in samples.items()],
     }
     whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
     errors = errors_by_gauge(kinds, true, whites, lambda scaled, i: light_error(scaled, true[i]))

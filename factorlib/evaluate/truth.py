@@ -103,7 +103,7 @@ def normal_error(
     return NormalError(int(known.sum()), *(AngleError(*each) for each in percentiles))
 
 
-def averaged_normals(normal: Float[np.ndarray, "h w 3"], factor: int) -> Float[np.ndarray, "i j 3"]:
+def average_normals(normal: Float[np.ndarray, "h w 3"], factor: int) -> Float[np.ndarray, "i j 3"]:
     """Return unit mean normals of boxes of factor × factor pixels; zero where under half of a box is known."""
     if factor == 1:
         return normal

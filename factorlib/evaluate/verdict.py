@@ -22,10 +22,10 @@ import msgspec
 import numpy as np
 
 from factorlib.evaluate.ball import OctahedralLight
-from factorlib.evaluate.picture_errors import tone_mapped
+from factorlib.evaluate.picture_errors import tone_map
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
 from factorlib.inference.materials import ROUGHNESS
-from factorlib.results.materials import Misfit, Reflectance, Solved
+from factorlib.results.materials import Misfit, Reflectance, SolvedMaterial
 from factorlib.results.metrics import Trust, Verdict
 
 # weights of (1)
@@ -42,7 +42,7 @@ MUCH = 0.1  # unexplained share from which an input is wrong and not only inaccu
 LEAST_SHARE = 0.2  # least share of e² for a term to be a reason
 
 
-def ball_changes(materials: Mapping[str, Solved], lights: Mapping[str, OctahedralLight]) -> dict[str, float]:
+def ball_changes(materials: Mapping[str, SolvedMaterial], lights: Mapping[str, OctahedralLight]) -> dict[str, float]:
     """Return the mean square change of each material's ball by its standard errors, m² of (1), mean over lights.
 
     Both arguments are in one gauge, and the materials have standard errors.
@@ -51,16 +51,16 @@ def ball_changes(materials: Mapping[str, Solved], lights: Mapping[str, Octahedra
     return {name: float(np.mean([_change(solved, balls) for balls in lit])) for name, solved in materials.items()}
 
 
-def _change(solved: Solved, lit: Appearances) -> float:
+def _change(solved: SolvedMaterial, lit: Appearances) -> float:
     """Return the mean square change of a ball in a light, summed over diffuse, specular and roughness."""
     ball = lit.ball(solved.reflectance)
     exposure = MEAN_SHOWN / max(float(ball.mean()), 1e-30)
-    shown = tone_mapped(ball, exposure)
-    squares = [np.mean((tone_mapped(lit.ball(other), exposure) - shown) ** 2) for other in _others(solved)]
+    display = tone_map(ball, exposure)
+    squares = [np.mean((tone_map(lit.ball(other), exposure) - display) ** 2) for other in _others(solved)]
     return float(np.sum(squares)) / 2
 
 
-def _others(solved: Solved) -> Iterator[Reflectance]:
+def _others(solved: SolvedMaterial) -> Iterator[Reflectance]:
     """Yield the reflectance with each of its parts one standard error lower and higher."""
     estimate = solved.reflectance
     errors = solved.stderr

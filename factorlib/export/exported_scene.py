@@ -28,7 +28,7 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.geometry.camera import Camera
 from factorlib.jsonfile import write_json
-from factorlib.light.lobes import SUN_DEG, Lobes, lobe_integral
+from factorlib.light.lobes import SUN_DEG, Lobes, lobe_energy
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import rigid
 from factorlib.wholefile import write_text
@@ -90,15 +90,15 @@ class Sun(msgspec.Struct, frozen=True):
     irradiance: Float[np.ndarray, "3"]
     angular_diameter_deg: float = SUN_DEG
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the sun as plain numbers, for JSON."""
-        return _plain(self, "direction", "irradiance", "angular_diameter_deg")
+        return _to_dict(self, "direction", "irradiance", "angular_diameter_deg")
 
 
-def suns_of(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
+def extract_suns(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
     """Return the suns of a light, turned by a rotation from the lobes' frame."""
     suns = lobes.take(lobes.suns)
-    energies = suns.weight * lobe_integral(suns.sharpness)[:, None]
+    energies = suns.weight * lobe_energy(suns.sharpness)[:, None]
     return [Sun(axis, energy) for axis, energy in zip(suns.axis @ rotation.T, energies, strict=True)]
 
 
@@ -143,15 +143,15 @@ def write_scene_json(path: str | Path, scene: ExportedScene) -> None:
                 "focal_px": camera.focal,
                 "principal_point": camera.centre,
             },
-            "shapes": [_plain(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
+            "shapes": [_to_dict(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
             "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
-            "light": _plain(scene.light, "file", "exposure", "camera_from_light"),
-            "suns": [sun.plain() for sun in scene.suns],
+            "light": _to_dict(scene.light, "file", "exposure", "camera_from_light"),
+            "suns": [sun.to_dict() for sun in scene.suns],
             "max_depth": scene.max_depth,
         },
     )
 
 
-def _plain(item: ExportedShape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
+def _to_dict(item: ExportedShape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
     values = {name: getattr(item, name) for name in names}
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

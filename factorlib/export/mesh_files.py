@@ -9,10 +9,10 @@ from factorlib.dataset.schema import MeshEntry, MeshInstance
 from factorlib.export.exported_scene import ExportedShape
 from factorlib.export.usd import SUFFIX, colours, write_usd_mesh
 from factorlib.meshes.ply_stl_off import submesh, write_ply
-from factorlib.meshes.read import MeshCache
+from factorlib.meshes.read_mesh import MeshCache
 from factorlib.results.materials import Reflectance
 from factorlib.results.poses import ObjectPose
-from factorlib.results.surface import read_surface
+from factorlib.results.surface_table import read_surface
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import paint, rigid
 

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from factorlib.export.exported_scene import ExportedScene
-from factorlib.results.materials import MaterialTable, Reflectance, Solved, StandardErrors
+from factorlib.results.materials import MaterialTable, Reflectance, SolvedMaterial, StandardErrors
 from factorlib.tracing.scene import bsdf
 from factorlib.wholefile import write_text
 
@@ -142,10 +142,10 @@ def table_in_gauge(table: MaterialTable, factor: float) -> MaterialTable:
     """Return the table with reflectances and standard errors times `factor`, which `gauge` records."""
     gauge = msgspec.structs.replace(table.gauge, export_factor=factor, export_rule=RULE)
 
-    def scaled(values: Solved | StandardErrors) -> Solved | StandardErrors:
+    def scale(values: SolvedMaterial | StandardErrors) -> SolvedMaterial | StandardErrors:
         """Return the diffuse and specular values times the factor."""
         diffuse, specular = (tuple(factor * v for v in colour) for colour in (values.diffuse, values.specular))
         return msgspec.structs.replace(values, diffuse=diffuse, specular=specular)
 
-    materials = {n: msgspec.structs.replace(scaled(m), stderr=scaled(m.stderr)) for n, m in table.materials.items()}
+    materials = {n: msgspec.structs.replace(scale(m), stderr=scale(m.stderr)) for n, m in table.materials.items()}
     return msgspec.structs.replace(table, materials=materials, gauge=gauge)

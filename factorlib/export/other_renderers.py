@@ -58,14 +58,14 @@ class Angles(msgspec.Struct, frozen=True):
     oh: Float[np.ndarray, "*n"]
 
 
-class Parts(msgspec.Struct, frozen=True):
+class BrdfTerms(msgspec.Struct, frozen=True):
     """A BRDF per channel, 1/steradian: diffuse + D(n·h) · lobe."""
 
     diffuse: Float[np.ndarray, "*n 3"]
     lobe: Float[np.ndarray, "*n 3"]
 
 
-Model = Callable[[Reflectance, Angles], Parts]
+Model = Callable[[Reflectance, Angles], BrdfTerms]
 Shadowing = Callable[[float, Angles], Float[np.ndarray, "*n"]]
 
 
@@ -74,36 +74,38 @@ def distribution(alpha: float, nh: Float[np.ndarray, "*n"]) -> Float[np.ndarray,
     return alpha**2 / (np.pi * ((alpha**2 - 1) * nh**2 + 1) ** 2)
 
 
-def solved(material: Reflectance, angles: Angles) -> Parts:
+def evaluate_solved_brdf(material: Reflectance, angles: Angles) -> BrdfTerms:
     """Evaluate the reflection model of the solve."""
-    return _parts(angles, material.diffuse, material.specular, separable(material.alpha, angles))
+    return _brdf_terms(angles, material.diffuse, material.specular, separable_smith(material.alpha, angles))
 
 
-def mtlx(material: Reflectance, angles: Angles) -> Parts:
+def mtlx(material: Reflectance, angles: Angles) -> BrdfTerms:
     """Evaluate the nodes of `factorlib.export.materialx`."""
     weight, _, specular = material.mixture
     brighter = 1 + np.multiply.outer(1 / albedo(material.alpha, angles.no) - 1, specular)
-    return _parts(angles, material.diffuse, weight * np.array(specular) * brighter, correlated(material.alpha, angles))
+    return _brdf_terms(
+        angles, material.diffuse, weight * np.array(specular) * brighter, correlated_smith(material.alpha, angles)
+    )
 
 
-def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
+def mtlx_standard_surface(material: Reflectance, angles: Angles) -> BrdfTerms:
     """Evaluate the standard surface of `factorlib.export.materialx`; for its F of 1, E · (1 + (1 − E)/E) = 1."""
     specular = np.multiply.outer(1 / albedo(material.alpha, angles.no), material.specular)
-    return _parts(angles, material.diffuse, specular, correlated(material.alpha, angles))
+    return _brdf_terms(angles, material.diffuse, specular, correlated_smith(material.alpha, angles))
 
 
-def usd(material: Reflectance, angles: Angles) -> Parts:
+def usd(material: Reflectance, angles: Angles) -> BrdfTerms:
     """Evaluate UsdPreviewSurface with the inputs in the file, at the roughness of `material`.
 
     `differences` passes the material with the roughness of the file.
     """
     inputs = shader_inputs(material)
     base = np.asarray(inputs["diffuseColor"])
-    visibility = separable(material.alpha, angles)
+    visibility = separable_smith(material.alpha, angles)
     if not inputs["useSpecularWorkflow"]:  # a metal
-        return _parts(angles, np.zeros(3), base, visibility)
+        return _brdf_terms(angles, np.zeros(3), base, visibility)
     fresnel = schlick(np.asarray(inputs["specularColor"]), 1.0, angles)
-    return _parts(angles, base * (1 - fresnel), fresnel, visibility)
+    return _brdf_terms(angles, base * (1 - fresnel), fresnel, visibility)
 
 
 # terms ---------------------------------------------------------------------------------------------------------------
@@ -114,12 +116,12 @@ def schlick(f0: Float[np.ndarray, "3"], f90: float, angles: Angles) -> Float[np.
     return f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)
 
 
-def separable(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
+def separable_smith(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
     """Return G1(n·i) G1(n·o) / (4 (n·i)(n·o)), finite at the horizon."""
     return 1 / ((angles.ni + _root(alpha, angles.ni)) * (angles.no + _root(alpha, angles.no)))
 
 
-def correlated(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
+def correlated_smith(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
     """Return the height-correlated Smith term over 4 (n·i)(n·o)."""
     return 0.5 / (angles.no * _root(alpha, angles.ni) + angles.ni * _root(alpha, angles.no))
 
@@ -136,17 +138,17 @@ def albedo(alpha: float, no: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]
 @cache
 def _albedo_table(alpha: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     nodes = (np.arange(ALBEDO_NODES) + 1) / ALBEDO_NODES
-    angles, weight = mirrored(alpha, nodes, ALBEDO_SAMPLES)
-    return nodes, (weight * correlated(alpha, angles)).mean(axis=-1)
+    angles, weight = sample_directions(alpha, nodes, ALBEDO_SAMPLES)
+    return nodes, (weight * correlated_smith(alpha, angles)).mean(axis=-1)
 
 
-def spread(count: int) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+def lattice_points(count: int) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
     """Return points spread evenly over [0, 1] × [0, π] (Fibonacci lattice); azimuths beyond π are mirror images."""
     index = np.arange(count)
     return (index + 0.5) / count, np.pi * (index * GOLDEN % 1)
 
 
-def mirrored(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Angles, Float[np.ndarray, "n s"]]:
+def sample_directions(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Angles, Float[np.ndarray, "n s"]]:
     """Sample light directions i for views at n·o = `no`, mirrored at half vectors distributed by D(n·h) n·h.
 
     The mean of weight · lobe is ∫ D · lobe · n·i di.  The weight is 4 (n·i)(o·h)/(n·h), and zero below the horizon.
@@ -160,7 +162,7 @@ def mirrored(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Ang
         The angles and the weights.
     """
     # sample h by D(n·h) n·h, mirror o at h, and weight by the Jacobian
-    u, phi = spread(count)
+    u, phi = lattice_points(count)
     nh = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
     oh = no[:, None] * nh + np.sqrt(1 - no[:, None] ** 2) * np.sqrt(1 - nh**2) * np.cos(phi)
     ni = 2 * oh * nh - no[:, None]
@@ -169,33 +171,33 @@ def mirrored(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Ang
     return Angles(ni.clip(0), np.broadcast_to(no[:, None], shape), np.broadcast_to(nh, shape), oh.clip(0)), weight
 
 
-def _gltf(material: Reflectance, angles: Angles, shadowing: Shadowing, extension: bool = True) -> Parts:
+def _gltf(material: Reflectance, angles: Angles, shadowing: Shadowing, extension: bool = True) -> BrdfTerms:
     """Evaluate a model of glTF with the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
     visibility = shadowing(material.alpha, angles)
     if entry["pbrMetallicRoughness"]["metallicFactor"]:
-        return _parts(angles, np.zeros(3), schlick(base, 1.0, angles), visibility)
+        return _brdf_terms(angles, np.zeros(3), schlick(base, 1.0, angles), visibility)
     specular = entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": 1.0}
     f90 = specular["specularFactor"]
     f0 = f90 * np.minimum(DIELECTRIC * np.broadcast_to(specular["specularColorFactor"], 3), 1)
     fresnel = schlick(f0, f90, angles)
-    return _parts(angles, base * (1 - fresnel.max(axis=-1, keepdims=True)), fresnel, visibility)
+    return _brdf_terms(angles, base * (1 - fresnel.max(axis=-1, keepdims=True)), fresnel, visibility)
 
 
-def _parts(
+def _brdf_terms(
     angles: Angles, diffuse: np.ndarray | tuple, specular: np.ndarray | tuple, visibility: Float[np.ndarray, "*n"]
-) -> Parts:
+) -> BrdfTerms:
     """Return the BRDF of a diffuse albedo, a Fresnel term (`specular`) and a shadowing term V (`visibility`)."""
     shape = (*angles.no.shape, 3)
-    return Parts(np.broadcast_to(np.asarray(diffuse) / np.pi, shape), visibility[..., None] * np.asarray(specular))
+    return BrdfTerms(np.broadcast_to(np.asarray(diffuse) / np.pi, shape), visibility[..., None] * np.asarray(specular))
 
 
 MODELS: dict[str, Model] = {
-    "blender": lambda m, angles: _parts(angles, m.diffuse, m.specular, correlated(m.alpha, angles)),
-    "glb": partial(_gltf, shadowing=separable),
-    "glb_correlated": partial(_gltf, shadowing=correlated),
-    "glb_plain": partial(_gltf, shadowing=separable, extension=False),
+    "blender": lambda m, angles: _brdf_terms(angles, m.diffuse, m.specular, correlated_smith(m.alpha, angles)),
+    "glb": partial(_gltf, shadowing=separable_smith),
+    "glb_correlated": partial(_gltf, shadowing=correlated_smith),
+    "glb_plain": partial(_gltf, shadowing=separable_smith, extension=False),
     "mtlx": mtlx,
     "mtlx_standard_surface": mtlx_standard_surface,
     "usd": usd,
@@ -212,17 +214,17 @@ def differences(material: Reflectance) -> dict[str, dict[str, float]]:
     """
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
     written = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
-    expected = ball(material, solved)
+    expected = ball_radiance(material, evaluate_solved_brdf)
     result = {}
     for name, model in MODELS.items():
-        rendered = ball(written[name], model)
+        rendered = ball_radiance(written[name], model)
         relative = (np.abs(rendered - expected) / np.maximum(expected, FLOOR))[(expected > 0) | (rendered > 0)]
         numbers = (relative.mean(), relative.max()) if relative.size else (0.0, 0.0)
         result[name] = dict(zip(("mean", "worst"), (round(float(value), 5) for value in numbers)))
     return result
 
 
-def ball(material: Reflectance, model: Model) -> Float[np.ndarray, "n 3"]:
+def ball_radiance(material: Reflectance, model: Model) -> Float[np.ndarray, "n 3"]:
     """Return the radiance of the ball's pixels in all lights: in a sky of radiance 1, and under lamps of irradiance π.
 
     Under a lamp it is f · n·i · π.
@@ -230,7 +232,7 @@ def ball(material: Reflectance, model: Model) -> Float[np.ndarray, "n 3"]:
     normals = ball_normals(PIXELS)[0]
     normals = normals[normals[:, 2] >= LEAST_COSINE]
     nodes = np.linspace(LEAST_COSINE, 1.0, SKY_NODES)
-    sky = in_sky(material, model, nodes)
+    sky = integrate_sky(material, model, nodes)
     pictures = [np.stack([np.interp(normals[:, 2], nodes, channel) for channel in sky.T], axis=-1)]
     view = np.array([0.0, 0.0, 1.0])
     for lamp in LAMPS.values():
@@ -244,7 +246,7 @@ def ball(material: Reflectance, model: Model) -> Float[np.ndarray, "n 3"]:
     return np.concatenate(pictures)
 
 
-def in_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+def integrate_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """Return the radiance ∫ f n·i di that a reflection model sends to views at some angles, in a sky of radiance 1.
 
     Args:
@@ -253,10 +255,10 @@ def in_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> 
         no: cosines n·o
     """
     # specular part, by importance sampling of the GGX distribution
-    angles, weight = mirrored(material.alpha, no, SKY_SAMPLES)
+    angles, weight = sample_directions(material.alpha, no, SKY_SAMPLES)
     specular = (weight[..., None] * model(material, angles).lobe).mean(axis=1)
     # diffuse part, by cosine-weighted sampling
-    square, phi = spread(SKY_SAMPLES)
+    square, phi = lattice_points(SKY_SAMPLES)
     ni = np.broadcast_to(np.sqrt(square), (len(no), square.size))
     no = np.broadcast_to(no[:, None], ni.shape)
     io = ni * no + np.sqrt((1 - ni**2) * (1 - no**2)) * np.cos(phi)

@@ -200,15 +200,15 @@ def _transform(matrix: Float[np.ndarray, "4 4"]) -> list[str]:
 
 
 def _layer(about: Sequence[str], lines: Sequence[str]) -> str:
-    return "\n".join(["#usda 1.0", "(", *_indented(about), ")", "", *lines, ""])
+    return "\n".join(["#usda 1.0", "(", *_indent(about), ")", "", *lines, ""])
 
 
 def _prim(head: str, lines: Sequence[str], about: Sequence[str] = ()) -> list[str]:
-    opened = [f"def {head} (", *_indented(about), ")"] if about else [f"def {head}"]
-    return [*opened, "{", *_indented(lines), "}"]
+    opened = [f"def {head} (", *_indent(about), ")"] if about else [f"def {head}"]
+    return [*opened, "{", *_indent(lines), "}"]
 
 
-def _indented(lines: Sequence[str]) -> list[str]:
+def _indent(lines: Sequence[str]) -> list[str]:
     return [INDENT + line for line in lines]
 
 

@@ -89,15 +89,15 @@ def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[st
     return bent
 
 
-def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
+def label_parts(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
     """Join all parts to one mesh with material labels, smooth within each part."""
     meshes = [smooth(vertices, faces, labels[name]) for name, (vertices, faces) in parts.items()]
-    vertices, faces = joined([(mesh.vertices, mesh.faces) for mesh in meshes])
+    vertices, faces = join_parts([(mesh.vertices, mesh.faces) for mesh in meshes])
     normals = np.concatenate([mesh.normals for mesh in meshes])
     return Mesh(vertices, faces.astype(np.int32), normals, np.concatenate([mesh.face_label for mesh in meshes]))
 
 
-def joined(parts: Sequence[Part]) -> Part:
+def join_parts(parts: Sequence[Part]) -> Part:
     """Join all parts to one."""
     first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
     faces = [faces + offset for (_, faces), offset in zip(parts, first)]
@@ -179,7 +179,7 @@ def legs(sides: int, rings: int, radii: Radii = DIMENSIONS.leg_radii) -> Part:
     for leg, low, other, high in DIMENSIONS.struts:
         ends = top[leg] + low * (foot[leg] - top[leg]), top[other] + high * (foot[other] - top[other])
         dowels.append(dowel(*ends, (DIMENSIONS.strut_radius,) * 3, max(5, sides // 2), 2))
-    return joined(dowels)
+    return join_parts(dowels)
 
 
 def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: Radii, sides: int, rings: int) -> Part:

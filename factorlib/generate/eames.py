@@ -17,14 +17,24 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, surroundings
-from factorlib.generate.chair import bent_chair, chair, labelled, rough_chair
+from factorlib.generate.chair import bent_chair, chair, label_parts, rough_chair
 from factorlib.generate.surroundings import EYE, Rng, SceneDict, random_materials
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape, transform
+from factorlib.tracing.scene import (
+    bsdf,
+    envmap,
+    incident_light,
+    look_rotation,
+    render_scene,
+    rigid,
+    sensor,
+    shape,
+    transform,
+)
 from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]
@@ -124,7 +134,7 @@ def generate(
         progress(number, len(shots), shot.name)
         scene = arrange_scene(shot, number, lat_longs, rng, spread, parameters)
         poses[shot.name] = scene.poses
-        photos.append(write_shot(out, scene, materials, parameters, 1000 * seed + number))
+        photos.append(write_chair_shot(out, scene, materials, parameters, 1000 * seed + number))
     meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
     options = "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(parameters, name))
     options += " --rough {},{}".format(*parameters.rough) if parameters.rough else ""
@@ -176,18 +186,20 @@ def arrange_scene(
     distance = shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1))
     eye = shot.eye + 0.15 * spread * rng.uniform(-1, 1)
     facing = shot.facing_deg + 40 * spread * rng.uniform(-1, 1)
-    level = look(0, yaw)
+    level = look_rotation(0, yaw)
     down = np.degrees(np.arctan2(eye - SET.middle, distance))
     place = -distance * level[:, 2] + [0, eye - EYE, 0]
     sideways = [0.0] if len(shot.chairs) == 1 else [-SET.apart, SET.apart]
     chairs = {}
     for k, (colour, aside) in enumerate(zip(shot.chairs, sideways)):
         # the chair's +z points toward the camera
-        turn = look(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])
+        turn = look_rotation(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
     camera = Camera(width, height, folder.focal_px_of_35mm(shot.focal_35mm, width, height), (width / 2, height / 2))
     if lat_longs:
-        around = {"light": envmap(surroundings.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
+        around = {
+            "light": envmap(surroundings.read_captured_light(lat_longs[number % len(lat_longs)], parameters.light_rows))
+        }
         if not parameters.distant:
             around["ground"] = surroundings.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))
     elif shot.sun:
@@ -195,10 +207,10 @@ def arrange_scene(
         around = surroundings.daylight(rng, up, yaw + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
     else:
         around = surroundings.room(rng, shot.windows, shot.lamps, clear_deg=yaw + 180, clear_half_deg=120)
-    return ChairScene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
+    return ChairScene(shot, around, camera, rigid(look_rotation(-down, yaw), place), chairs)
 
 
-def write_shot(
+def write_chair_shot(
     out: Path, scene: ChairScene, materials: dict[str, Reflectance], parameters: ChairSetOptions, seed: int
 ) -> dict:
     """Render, expose and write one photo, with its masks, its light in the photo's units, and its normals.
@@ -219,8 +231,8 @@ def write_shot(
     names = list(materials)
     poses = list(scene.poses.values())
     wood = names.index("wood") + 1
-    meshes = [labelled(chair(), {"shell": names.index(colour) + 1, "legs": wood}) for colour in shot.chairs]
-    labels = folder.labels_of(meshes, camera, poses)
+    meshes = [label_parts(chair(), {"shell": names.index(colour) + 1, "legs": wood}) for colour in shot.chairs]
+    labels = folder.label_pixels(meshes, camera, poses)
     light, radiance = render_shot(scene, meshes, list(materials.values()), parameters, seed)
     # exposure that clips the share `clipped` of the chairs' pixels
     on_chair = (labels > 0) & (labels < LEFT_OUT)
@@ -272,4 +284,4 @@ def render_shot(
     }
     depth = 2 if parameters.direct else -1
     film = sensor(scene.camera, scene.world_from_camera)
-    return light, rendered(around | solids, film, parameters.spp, seed, depth)
+    return light, render_scene(around | solids, film, parameters.spp, seed, depth)

@@ -12,7 +12,7 @@ from factorlib.dataset.schema import LEFT_OUT
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Maps, rasterise
 from factorlib.images.exif import FILM_DIAGONAL
-from factorlib.images.exr import FIXED_DATE, LAT_LONG, encoded, write_exr, write_rgb_exr
+from factorlib.images.exr import FIXED_DATE, LAT_LONG, encode_pixels, write_exr, write_rgb_exr
 from factorlib.images.tone import srgb_encode
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_bytes, write_text
@@ -41,7 +41,7 @@ def write_photo(path: Path, radiance: Image, focal_35mm: float | None = None, qu
         attributes |= {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"}
     if focal_35mm is not None:
         attributes["Exif:FocalLengthIn35mmFilm"] = round(focal_35mm)
-    write_bytes(path, encoded(path, (values * top + 0.5).astype(kind), attributes))
+    write_bytes(path, encode_pixels(path, (values * top + 0.5).astype(kind), attributes))
 
 
 def focal_px_of_35mm(focal_35mm: float, width: int, height: int) -> float:
@@ -60,7 +60,7 @@ def focal_px_of_35mm(focal_35mm: float, width: int, height: int) -> float:
 
 def write_labels(path: Path, labels: Int[np.ndarray, "h w"]) -> None:
     """Write labels as a one-channel 8-bit PNG: 0 background, k the k-th material, 255 left out."""
-    write_bytes(path, encoded(path, labels.astype(np.uint8)[..., None]))
+    write_bytes(path, encode_pixels(path, labels.astype(np.uint8)[..., None]))
 
 
 def write_light(path: Path, lat_long: Image) -> None:
@@ -105,7 +105,7 @@ def write_obj(path: Path, parts: Mapping[str, tuple[np.ndarray, ...]]) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def labels_of(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
+def label_pixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
     """Return the material label of each pixel; 255 if the pixel with a margin of a quarter shows several materials.
 
     Args:
@@ -164,15 +164,15 @@ def write_yaml(path: Path, value: dict[str, Any], comment: str) -> None:
         value: Mapping.
         comment: First line.
     """
-    write_text(path, f"# {comment}\n{yaml_text(_rounded(value))}")
+    write_text(path, f"# {comment}\n{yaml_text(_round_floats(value))}")
 
 
-def _rounded(value: Any) -> Any:
+def _round_floats(value: Any) -> Any:
     """Round all floats of nested mappings and lists."""
     if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
+        return {key: _round_floats(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_rounded(item) for item in value]
+        return [_round_floats(item) for item in value]
     return (round(float(value), 6) if abs(value) >= 1e-4 else 0.0) if isinstance(value, float) else value
 
 

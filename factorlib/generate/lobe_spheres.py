@@ -52,7 +52,7 @@ def random_spheres(rng: np.random.Generator, count: int) -> Spheres:
     return Spheres(axis, sharpness, np.sqrt(alpha))
 
 
-def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator) -> Pixels:
+def render_spheres(spheres: Spheres, pixels: int, rng: np.random.Generator) -> Pixels:
     """Render random pixels of each sphere by Mitsuba.
 
     Args:

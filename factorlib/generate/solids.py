@@ -87,7 +87,7 @@ def star(radius: Callable[[np.ndarray], np.ndarray]) -> Mesh:
     return closed_grid(direction * radius(direction)[..., None], *(poles * radius(poles)[:, None]))
 
 
-def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
+def revolve(profile: Float[np.ndarray, "n 2"]) -> Mesh:
     """Return the surface of revolution about y of a profile (radius, y), from the top pole to the bottom one."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     curve = PchipInterpolator(length, profile)(np.arange(1, ROWS) / ROWS * length[-1])
@@ -99,7 +99,7 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
 
 SHAPES: dict[str, Callable[[], Mesh]] = {
     "sphere": sphere,
-    "vase": partial(revolved, np.array(VASE)),
-    "bottle": partial(revolved, np.array(BOTTLE)),
+    "vase": partial(revolve, np.array(VASE)),
+    "bottle": partial(revolve, np.array(BOTTLE)),
     "blob": blob,
 }

@@ -88,7 +88,7 @@ def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: floa
         angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
         size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
-        scene[f"facade_{k}"] = block(place, size, np.degrees(angle), _vivid(rng))
+        scene[f"facade_{k}"] = rotated_box(place, size, np.degrees(angle), _vivid_colour(rng))
     return scene
 
 
@@ -117,7 +117,7 @@ def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_
         paint = np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
         scene[f"wall{side}"] = wall(side, distance, (width, 1.6), paint, (0, 0.25))
         size = rng.uniform(0.3, 0.6, 2)
-        colour = _vivid(rng)
+        colour = _vivid_colour(rng)
         shift = rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5)
         scene[f"picture{side}"] = wall(side, distance - 0.02, size, colour, shift)
     for k, side in enumerate(rng.permutation(sides)[:windows]):
@@ -135,11 +135,11 @@ def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_
         angle = np.radians(clear_deg + clear_half_deg + rng.uniform(0, 1) * (360 - 2 * clear_half_deg))
         size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(1.9, 2.3) + [0, size[1] - EYE, 0]
-        scene[f"block_{k}"] = block(place, size, np.degrees(angle), _vivid(rng))
+        scene[f"block_{k}"] = rotated_box(place, size, np.degrees(angle), _vivid_colour(rng))
     return scene
 
 
-def _vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def _vivid_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """Draw a saturated colour."""
     return 0.06 + 0.65 * rng.dirichlet([0.7, 0.7, 0.7])
 
@@ -172,7 +172,9 @@ def wall(
     return shape if glow is None else shape | {"emitter": {"type": "area", "radiance": rgb(glow)}}
 
 
-def block(place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour) -> SceneDict:
+def rotated_box(
+    place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour
+) -> SceneDict:
     """Return a box rotated about y.
 
     Args:
@@ -189,7 +191,7 @@ def block(place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg:
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
 
 
-def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
+def read_captured_light(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     """Read a user's lat-long map (.exr, .hdr), averaged to `height` rows and scaled to a mean radiance of 1."""
     radiance = read_light_map(path)
     if (rows := len(radiance)) % height:

@@ -18,13 +18,13 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder
 from factorlib.generate.solids import SHAPES
-from factorlib.generate.surroundings import Rng, Rotation, captured, daylight, random_materials, room
+from factorlib.generate.surroundings import Rng, Rotation, daylight, random_materials, read_captured_light, room
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import bsdf, envmap, incident_light, look_rotation, render_scene, rigid, sensor, shape
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0
@@ -145,8 +145,8 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Synthe
     poses = {}
     for number, shot in enumerate(SHOTS):
         progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
-        world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
-        light = light_of(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
+        world_from_camera = look_rotation(rng.uniform(-14, -6), rng.uniform(0, 360))
+        light = photo_light(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
         poses[shot.name] = place_objects(shot, world_from_camera, rng, spread)
         photos.append(
@@ -159,7 +159,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Synthe
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
 
 
-def light_of(
+def photo_light(
     number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: Rng, rows: int, spp: int
 ) -> Float[np.ndarray, "h w 3"]:
     """Return the light of a photo in the camera's y-up frame.
@@ -179,7 +179,7 @@ def light_of(
         A lat-long map.
     """
     if lat_longs:
-        return captured(lat_longs[number % len(lat_longs)], rows)
+        return read_captured_light(lat_longs[number % len(lat_longs)], rows)
     seed = int(rng.integers(1 << 24))
     if number:
         scene = room(rng, windows=2, lamps=number)
@@ -237,7 +237,7 @@ def write_shot(out: Path, scene: SyntheticScene, parameters: SyntheticOptions, s
         mesh = scene.meshes[placement.shape]
         label = np.full(len(mesh.faces), order.index(placement.material) + 1, np.int16)
         labelled.append(msgspec.structs.replace(mesh, face_label=label))
-    labels = folder.labels_of(labelled, camera, poses)
+    labels = folder.label_pixels(labelled, camera, poses)
     radiance = compose_photo(scene, camera, parameters.spp, seed)
     # exposure that clips the given fraction of object pixels, or just none; a float file gets a mean of ¼
     brightest = radiance[(labels > 0) & (labels < LEFT_OUT)].max(axis=-1)
@@ -287,6 +287,6 @@ def compose_photo(scene: SyntheticScene, camera: Camera, spp: int, seed: int) ->
         used = np.flatnonzero(mask.any(axis=0))
         columns = slice(used[0], used[-1] + 1)
         entries = {"shape": solid, "light": envmap(scene.light)}
-        alone = rendered(entries, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2)
-        radiance[:, columns][mask[:, columns]] = alone[mask[:, columns]]
+        rendering = render_scene(entries, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2)
+        radiance[:, columns][mask[:, columns]] = rendering[mask[:, columns]]
     return radiance

@@ -2,6 +2,6 @@
 
 camera      cameras and rigid poses
 raster      ray casting and rasterisation of meshes
-visibility  directions in which a surface point is not occluded by the objects of its photo
+occlusion   directions in which a surface point is not occluded by the objects of its photo
 sphere      even sets of directions, mirror directions, cells of directions, codes of hiding surfaces
 """

@@ -50,7 +50,7 @@ def is_heif(path: str | Path) -> bool:
 def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
     """Open a HEIF photo; InputError if it cannot be decoded, or has a transfer function of HDR video."""
 
-    def refused(fault: str, cure: str) -> InputError:
+    def refusal(fault: str, cure: str) -> InputError:
         """Return an InputError for this file."""
         return InputError(fault, file=path, key=key, cure=cure)
 
@@ -61,12 +61,12 @@ def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
         file = pillow_heif.open_heif(path, convert_hdr_to_8bit=False, hdr_to_16bit=False)
         picture = file[file.primary_index]
     except FAILURES as error:
-        raise refused(f"not readable as HEIF ({error})", convert) from None
+        raise refusal(f"not readable as HEIF ({error})", convert) from None
     info = picture.info
     width, height = picture.size
     curve = VIDEO.get((info.get("nclx_profile") or {}).get("transfer_characteristics", 0))
     if curve:
-        raise refused(
+        raise refusal(
             f"is encoded for HDR video ({curve}), not as sRGB", "export it from the phone as a JPEG, or without HDR"
         )
 
@@ -76,10 +76,10 @@ def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
         try:
             codes = np.asarray(picture)
         except FAILURES as error:
-            raise refused(f"truncated or damaged ({error})", COPY) from None
+            raise refusal(f"truncated or damaged ({error})", COPY) from None
         if codes.shape[:2] != (height, width):
             sizes = f"{codes.shape[1]}×{codes.shape[0]} pixels instead of the {width}×{height} of its header"
-            raise refused(f"truncated or damaged ({sizes})", COPY)
+            raise refusal(f"truncated or damaged ({sizes})", COPY)
         codes = codes[..., None] if codes.ndim == 2 else codes
         return codes[..., :3] if codes.shape[2] >= 3 else np.broadcast_to(codes[..., :1], (height, width, 3))
 
@@ -135,7 +135,7 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
     )  # for files other than TIFF
 
     @cache
-    def developed() -> tuple[np.ndarray, np.ndarray]:
+    def develop() -> tuple[np.ndarray, np.ndarray]:
         """Return 16-bit linear codes, not rotated, and a mask of saturated pixels."""
         with sensor:
             try:
@@ -150,7 +150,7 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
                 )
             except rawpy.LibRawError as error:
                 raise _refusal("cannot be developed", error, path, key) from None
-            return pixels[rows, columns], _saturated(sensor)[rows, columns]
+            return pixels[rows, columns], _saturation_mask(sensor)[rows, columns]
 
     return OpenPhoto(
         width=columns.stop - columns.start,
@@ -159,8 +159,8 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
         exif={**dict(zip(TAGS, camera)), **read_exif(path)},
         white=WHITE,
         encoding="linear",
-        rows=lambda begin, end: developed()[0][begin:end],
-        saturated=lambda begin, end: np.repeat(developed()[1][begin:end, :, None], 3, axis=2),
+        rows=lambda begin, end: develop()[0][begin:end],
+        saturated=lambda begin, end: np.repeat(develop()[1][begin:end, :, None], 3, axis=2),
     )
 
 
@@ -187,7 +187,7 @@ def _crop(sizes: Any) -> tuple[slice, slice]:
     return slice(0, sizes.iheight), slice(0, sizes.iwidth)
 
 
-def _saturated(sensor: Any) -> Bool[np.ndarray, "h w"]:
+def _saturation_mask(sensor: Any) -> Bool[np.ndarray, "h w"]:
     """Return a mask of developed pixels for which some contributing sensor pixel has reached the white level.
 
     The sensor's white level is the top code of its least amplified channel.

@@ -116,8 +116,8 @@ def exif_focal_px(exif: Mapping[str, Any], width: int, height: int, file: str | 
     else:
         return None
     shape = _proportion(width, height)
-    as_taken = not (across and down) or abs(shape / _proportion(across, down) - 1) <= SAME_SHAPE
-    if not (as_taken and any(abs(shape / frame - 1) <= SAME_SHAPE for frame in FRAMES)):
+    is_uncropped = not (across and down) or abs(shape / _proportion(across, down) - 1) <= SAME_SHAPE
+    if not (is_uncropped and any(abs(shape / frame - 1) <= SAME_SHAPE for frame in FRAMES)):
         log.warning("%s: is a crop of what the camera took, so its EXIF focal length is not used", file)
         return None
     return focal_px

@@ -23,7 +23,7 @@ FORMATS = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
 
 
-def encoded(
+def encode_pixels(
     name: str | Path,
     pixels: np.ndarray,
     attributes: Mapping[str, Any] | None = None,
@@ -76,7 +76,7 @@ def write_exr(path: str | Path, channels: Channels, attributes: Mapping[str, str
     """
     pixels = np.stack([np.asarray(values, dtype=np.float32) for values in channels.values()], axis=-1)
     fixed = {"compression": "zip", "DateTime": FIXED_DATE, "Software": "factorlib"}
-    write_bytes(path, encoded(path, pixels, {**fixed, **(attributes or {})}, list(channels)))
+    write_bytes(path, encode_pixels(path, pixels, {**fixed, **(attributes or {})}, list(channels)))
 
 
 def write_rgb_exr(path: str | Path, radiance: Float[np.ndarray, "h w 3"], attributes: Mapping | None = None) -> None:
@@ -95,7 +95,7 @@ def write_hdr(path: str | Path, radiance: Float[np.ndarray, "h w 3"]) -> None:
 
     Other programs read a file without alpha and without a layout attribute as a lat-long map.
     """
-    write_bytes(path, encoded(path, np.asarray(radiance, dtype=np.float32)))
+    write_bytes(path, encode_pixels(path, np.asarray(radiance, dtype=np.float32)))
 
 
 def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:

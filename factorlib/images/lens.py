@@ -31,12 +31,12 @@ class RadialLens(msgspec.Struct, frozen=True):
         params = [self.focal, *self.centre, *self.coefficients]
         return pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
 
-    def distorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def distort(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Map points of the pinhole picture to points of the photo."""
         slopes = (points - np.array(self.centre)) / self.focal
         return self.colmap.img_from_cam(np.column_stack([slopes, np.ones(len(slopes))]))
 
-    def undistorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def undistort(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Map points of the photo to points of the pinhole picture."""
         return self.focal * self.colmap.cam_from_img(points) + np.array(self.centre)
 
@@ -83,7 +83,7 @@ def radial_lens(camera: Intrinsics | None, factor: int, width: int, height: int)
     return RadialLens(camera.focal_px / factor, (centre[0] / factor, centre[1] / factor), camera.distortion)
 
 
-class Undistorted:
+class Undistortion:
     """Resampling of a photo to the picture of a pinhole camera, height × width pixels each.
 
     The attribute `inside` is the mask of pixels that the photo shows.
@@ -91,7 +91,7 @@ class Undistorted:
 
     def __init__(self, lens: RadialLens, height: int, width: int):
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        place = lens.distorted(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(height, width, 2) - 0.5
+        place = lens.distort(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(height, width, 2) - 0.5
         self.rows = place[..., 1]
         self.columns = place[..., 0]
         ends = ((self.rows, height), (self.columns, width))
@@ -99,7 +99,7 @@ class Undistorted:
             [(places >= 0) & (places <= n - 1) for places, n in ends]
         )
 
-    def nearest(self, picture: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
+    def resample_nearest(self, picture: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
         """Resample by the nearest pixels, 0 outside the photo."""
         y, x = (
             np.clip(np.rint(places), 0, n - 1).astype(int)
@@ -107,14 +107,14 @@ class Undistorted:
         )
         return np.where(self.inside, picture[y, x], np.zeros((), picture.dtype))
 
-    def between(self, picture: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    def interpolate(self, picture: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         """Resample by bilinear interpolation, 0 outside the photo."""
         return map_coordinates(picture.astype(np.float32), (self.rows, self.columns), order=1, cval=0.0)
 
     def photo(self, photo: Photo) -> Photo:
         """Resample a photo; a pixel is clipped if any of its four source pixels is, and finite if all are."""
         channels = range(3)
-        radiance = np.stack([self.between(photo.radiance[..., c]) for c in channels], axis=-1)
-        clipped = np.stack([self.between(photo.clipped[..., c]) > 1e-6 for c in channels], axis=-1)
-        finite = self.inside & (self.between(~photo.finite) < 1e-6)
+        radiance = np.stack([self.interpolate(photo.radiance[..., c]) for c in channels], axis=-1)
+        clipped = np.stack([self.interpolate(photo.clipped[..., c]) > 1e-6 for c in channels], axis=-1)
+        finite = self.inside & (self.interpolate(~photo.finite) < 1e-6)
         return msgspec.structs.replace(photo, radiance=radiance, clipped=clipped & finite[..., None], finite=finite)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.images.photo import decoded, least_factor, open_photo
+from factorlib.images.photo import decode_photo, least_factor, open_photo
 from factorlib.images.scanlines import check_values
 from factorlib.reading import check_plain
 
@@ -74,7 +74,7 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
 
     factor = least_factor(height * width, MOST_TEXELS)
     factor = next((divisor for divisor in range(factor, 2 * factor) if height % divisor == 0), factor)
-    radiance = decoded(opened, "linear", factor, path, look).radiance
+    radiance = decode_photo(opened, "linear", factor, path, look).radiance
     if lost:
         fault = f"{lost} pixels are NaN, infinite or above {LARGEST:g}"
         raise InputError(fault, file=path, key=key, cure="replace these pixels, or export the map again")

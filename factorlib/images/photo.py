@@ -95,22 +95,22 @@ def read_photo(path: str | Path, encoding: str | None = None, key: str | None = 
     Raises:
         InputError: As `open_photo` does, and if the file is truncated.
     """
-    return decoded(open_photo(path, key), encoding, 1, path)
+    return decode_photo(open_photo(path, key), encoding, 1, path)
 
 
-def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path, key: str | None = None) -> None:
+def check_bright(photo: Photo, mask: Bool[np.ndarray, "h w"], path: str | Path, key: str | None = None) -> None:
     """Check that some finite pixel of a region has positive radiance.
 
     Args:
         photo: The photo.
-        where: Mask of the region.
+        mask: Mask of the region.
         path: File to name in the error.
         key: Key to name in the error.
 
     Raises:
         InputError: If all pixels are black or negative.
     """
-    if not (photo.radiance[where & photo.finite] > 0).any():
+    if not (photo.radiance[mask & photo.finite] > 0).any():
         raise InputError(
             "every pixel in its mask is black, or less than 0",
             file=path,
@@ -119,7 +119,7 @@ def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path,
         )
 
 
-def decoded(
+def decode_photo(
     opened: OpenPhoto,
     encoding: str | None,
     factor: int,
@@ -141,7 +141,7 @@ def decoded(
     clipped = np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(opened, factor, path):
-        linear = _linear(codes, opened.white, encoding)
+        linear = _linearise(codes, opened.white, encoding)
         look(linear)
         numbers = np.logical_and.reduce(np.isfinite(linear), -1)
         linear[~numbers] = 0
@@ -151,7 +151,7 @@ def decoded(
     if profile and "srgb" not in profile.lower() and "709" not in profile:
         advice = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
         log.warning("%s: its colour profile is %r; %s", path, profile, advice)
-    radiance, clipped, finite = (_displayed(pixels, opened.orientation) for pixels in (radiance, clipped, finite))
+    radiance, clipped, finite = (_orient(pixels, opened.orientation) for pixels in (radiance, clipped, finite))
     focal_px = exif_focal_px(opened.exif, opened.width, opened.height, path)
     return Photo(
         radiance,
@@ -166,7 +166,7 @@ def decoded(
     )
 
 
-def _linear(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
+def _linearise(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
     """Decode codes to linear values: computed for floats and wide codes, looked up for codes of up to 16 bits."""
     decode = DECODERS[encoding]
     if white is None:
@@ -177,9 +177,9 @@ def _linear(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str
     return decode(np.arange(white + 1) / white).astype(np.float32)[codes]
 
 
-def _displayed(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "i j *c"]:
+def _orient(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "i j *c"]:
     """Rotate and mirror stored pixels as their EXIF orientation demands."""
-    rows, columns = (-1 if flip else 1 for flip in _flipped(orientation))
+    rows, columns = (-1 if flip else 1 for flip in _reversed_axes(orientation))
     return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation >= 5 else pixels)[::rows, ::columns])
 
 
@@ -190,7 +190,7 @@ def _strips(
 
     Boxes count from the displayed corner, so the remainder is at the other end of an axis that display reverses.
     """
-    flips = _flipped(opened.orientation)
+    flips = _reversed_axes(opened.orientation)
     turned = flips[::-1] if opened.orientation >= 5 else flips
     top, left = (n % factor if reversed_axis else 0 for n, reversed_axis in zip((opened.height, opened.width), turned))
     columns = slice(left, left + opened.width // factor * factor)
@@ -209,7 +209,7 @@ def _strips(
             opened.rows(end, opened.height)  # a file that is truncated in the remainder must raise too
 
 
-def _flipped(orientation: int) -> tuple[bool, bool]:
+def _reversed_axes(orientation: int) -> tuple[bool, bool]:
     """Return whether display reverses the rows, and the columns, after orientations 5 to 8 have swapped them."""
     return orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
 

@@ -11,7 +11,7 @@ from PIL import Image
 from PIL.ImageColor import getrgb
 from scipy.optimize import linear_sum_assignment
 
-from factorlib.images.exr import encoded
+from factorlib.images.exr import encode_pixels
 from factorlib.images.tone import srgb_encode
 from factorlib.reading import reading
 from factorlib.wholefile import write_bytes
@@ -34,7 +34,7 @@ PALETTE = (
 
 def exposure_of(
     radiance: Float[np.ndarray, "*batch 3"],
-    where: Bool[np.ndarray, "*batch"] | None = None,
+    mask: Bool[np.ndarray, "*batch"] | None = None,
     percentile: float = PERCENTILE,
 ) -> float:
     """Return the factor that takes the `percentile` of each pixel's brightest channel to white.
@@ -43,7 +43,7 @@ def exposure_of(
 
     Args:
         radiance: Linear radiance.
-        where: Mask of the pixels that count.
+        mask: Mask of the pixels that count.
         percentile: Percentile.
 
     Returns:
@@ -53,7 +53,7 @@ def exposure_of(
     4.0
     """
     brightest = np.asarray(radiance).max(axis=-1)
-    brightest = brightest[np.isfinite(brightest) & (True if where is None else where)]
+    brightest = brightest[np.isfinite(brightest) & (True if mask is None else mask)]
     white = float(np.percentile(brightest, percentile)) if brightest.size else 0.0
     return 1 / white if white > 0 else 1.0
 
@@ -80,7 +80,7 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
     """Encode an 8-bit PNG of 1, 3 or 4 channels (alpha not premultiplied), without date or program name."""
     pixels = np.asarray(pixels, dtype=np.uint8)
     # compression level 4 takes half the time of the default, 6, for 5 % more bytes
-    return encoded("picture.png", pixels, {"oiio:UnassociatedAlpha": 1, "png:compressionLevel": 4})
+    return encode_pixels("picture.png", pixels, {"oiio:UnassociatedAlpha": 1, "png:compressionLevel": 4})
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:

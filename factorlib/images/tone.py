@@ -38,11 +38,11 @@ def slope(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float)
 
 def by_log_exponent(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
     """Return dτ/d log g, the derivative of the tone curve (1) with respect to its log exponent."""
-    at_x, at_black, at_one = (end**exponent * np.log(end) for end in (x + TOE, TOE, 1 + TOE))
-    return exponent * (at_x - at_black - curve(x, exponent) * (at_one - at_black)) / _range(exponent)
+    term_x, term_black, term_one = (end**exponent * np.log(end) for end in (x + TOE, TOE, 1 + TOE))
+    return exponent * (term_x - term_black - curve(x, exponent) * (term_one - term_black)) / _range(exponent)
 
 
-def shown(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
+def apply_tone(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
     """Apply the tone curve to linear radiance; radiance `pivot` is unchanged.
 
     Args:
@@ -56,8 +56,8 @@ def shown(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> F
     return pivot * curve(radiance / pivot, exponent)
 
 
-def straightened(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
-    """Undo the tone curve of a photo, the inverse of `shown`.
+def invert_tone(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
+    """Undo the tone curve of a photo, the inverse of `apply_tone`.
 
     Args:
         radiance: Values of the photo.

@@ -18,15 +18,15 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.fit_runner import Solution
 from factorlib.inference.gauge import DETERMINED, GIVEN, RULE, UP_TO_SCALE, connected_components
 from factorlib.inference.lights import Light
+from factorlib.inference.material_prior import likeliest_class
 from factorlib.inference.materials import LEAST_REFLECTANCE, Materials
 from factorlib.inference.misfit import unexplained_shares
-from factorlib.inference.priors import likeliest_class
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.uncertainty import ABSOLUTE, GAUGE, MaterialErrors
 from factorlib.light.lobes import Lobes
 from factorlib.results import materials as table
 from factorlib.results.materials import Decision, Uncertainty
-from factorlib.results.solution import Earlier
+from factorlib.results.solution import EarlierSolution
 
 LOBES_CHOSEN_BY = {
     "joint": "cells of the light prior, of which the brightest split while the marginal likelihood rises",
@@ -53,7 +53,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
     errors: MaterialErrors
     relative: dict[str, float]
     solver: Literal["joint", "paper"]
-    earlier: Earlier | None = None
+    earlier: EarlierSolution | None = None
 
     @cached_property
     def radiance(self) -> list[Float[np.ndarray, "n 3"]]:
@@ -66,12 +66,12 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         stderr = self._errors()
         kinds = self._kinds()
         solved = {
-            name: table.solved(table.Reflectance(*row), stderr[name], kind, self._known_parts(m))
+            name: table.attach_errors(table.Reflectance(*row), stderr[name], kind, self._known_parts(m))
             for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
         }
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
-        absolute = self.solution.interreflection.kept
+        absolute = self.solution.interreflection.accepted
         gauge = table.Gauge(RULE + DETERMINED * absolute + self._known_rule(), component, self._gauge_of_errors())
         return table.MaterialTable(solved, gauge, self.model())
 
@@ -107,7 +107,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         """Return the sentence that states the gauge of the standard errors."""
         return (
             GAUGE
-            + ABSOLUTE * self.solution.interreflection.kept
+            + ABSOLUTE * self.solution.interreflection.accepted
             + uncertainty.GIVEN * bool(self.problem.known.materials or self.problem.known.lights)
         )
 
@@ -127,7 +127,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def lights(self) -> dict[str, Lobes]:
         """Return the lobes by illumination, in scene radiance."""
-        return {block.name: light.lobes.scaled(block.unit) for block, light in self.illuminations()}
+        return {block.name: light.lobes.scale(block.unit) for block, light in self.illuminations()}
 
     def exposures(self) -> dict[str, table.Channels]:
         """Return each photo's factor on its light, per channel."""
@@ -144,19 +144,19 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         """Return the model choices and their evidence; the pivots of tone curves are in scene radiance."""
         solution = self.solution
         illuminations = self.illuminations()
-        started: table.Started | UnsetType = UNSET
+        started: table.WarmStart | UnsetType = UNSET
         lights = [block.name for block, _ in illuminations]
         if self.earlier is not None:
             known = set(self.names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
-            started = table.Started(*map(sorted, known))
+            started = table.WarmStart(*map(sorted, known))
         return table.Model(
             solver=self.solver,
             lobes={block.name: len(light) for block, light in illuminations},
             lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase == "subset"],
-            self_shadowing=solution.shadows.kept,
+            self_shadowing=solution.shadows.accepted,
             self_shadowing_chosen_by=_comparison(solution.shadows),
-            interreflection=solution.interreflection.kept,
+            interreflection=solution.interreflection.accepted,
             interreflection_chosen_by=_comparison(solution.interreflection),
             light_prior=self.solver == "joint",
             splitting_chosen_by=solution.splitting,
@@ -180,4 +180,4 @@ def _rows(materials: Materials) -> list[tuple[table.Channels, table.Channels, fl
 
 def _comparison(decision: Decision) -> dict[str, float]:
     """Return the held-out losses of the models that were compared, and the margin."""
-    return {k: value for k, value in msgspec.structs.asdict(decision).items() if k != "kept" and value is not None}
+    return {k: value for k, value in msgspec.structs.asdict(decision).items() if k != "accepted" and value is not None}

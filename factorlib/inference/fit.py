@@ -31,9 +31,9 @@ from factorlib.inference.blocks import FIT_LOSS, Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
+from factorlib.inference.material_prior import MaterialPrior, material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.optimizer import Descent, LossReport
-from factorlib.inference.priors import MaterialPrior, material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.responses import ResponseCache
 from factorlib.light.prior import LightPrior

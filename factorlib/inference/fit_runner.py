@@ -97,7 +97,7 @@ class SolveState(msgspec.Struct, frozen=True):
 
     def effective_problem(self, problem: JointProblem) -> JointProblem:
         """Return the problem under the chosen effects: with or without shadows and interreflection."""
-        return problem.with_effects(self.shadows.kept, self.interreflection.kept)
+        return problem.with_effects(self.shadows.accepted, self.interreflection.accepted)
 
 
 class Solution(SolveState, frozen=True, kw_only=True):

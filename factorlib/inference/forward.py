@@ -249,18 +249,18 @@ class Illumination(msgspec.Struct, frozen=True):
         by_photos = self._by_photos(prediction, scale, rising)
         free = light.free if light.fixed.any() else slice(None)
         for m, rows, lookup in prediction.responses:
-            of_specular = lookup.specular
-            of_roughness = lookup.by_roughness
+            unit_specular = lookup.specular
+            unit_slope = lookup.by_roughness
             for c in range(3):
                 kd = np.float32(self.materials.diffuse[m, c])
                 ks = np.float32(self.materials.specular[m, c])
                 # ∂r/∂u = τ' e (k_d D + k_s S) w/σ, and its derivative by roughness
                 bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
-                by_roughness = of_roughness * (ks * bright)
+                by_roughness = unit_slope * (ks * bright)
                 factors = ((kd, prediction.diffuse), (ks, prediction.specular), (ks, prediction.by_roughness))
                 by_material = np.column_stack([k * values[rows, c] * rising[rows, c] for k, values in factors])
                 diffuse = lookup.diffuse * (kd * bright)
-                specular = of_specular * (ks * bright)
+                specular = unit_specular * (ks * bright)
                 by_photo = by_photos[c][rows]
                 if light.scale_free:  # ∂r/∂ log of the factor on known cells
                     by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.fixed].sum(1, keepdims=True)])

@@ -40,7 +40,7 @@ def bounced_light(observations: Observations, radiance: Float[np.ndarray, "n 3"]
 
     Normals, views and directions are in the camera frame of each photo.
     """
-    if observations.visibility is None or observations.met is None:
+    if observations.visibility is None or observations.occluder is None:
         return None
     incoming = np.zeros((len(observations), 6))
     hidden = observations.visibility.min(1) < 255
@@ -49,12 +49,12 @@ def bounced_light(observations: Observations, radiance: Float[np.ndarray, "n 3"]
         surfaces = radiance_by_code(observations.take(rows), radiance[rows])
         shadowed = rows[hidden[rows]]
         for chunk in np.split(shadowed, range(CHUNK_ROWS, len(shadowed), CHUNK_ROWS)):
-            incoming[chunk] = _received_from(observations.take(chunk), surfaces)
+            incoming[chunk] = _bounced_from(observations.take(chunk), surfaces)
     return incoming
 
 
 def radiance_by_code(observations: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
-    """Return B of every code of `Observations.met` in one photo; the last row is the radiance of an unknown surface."""
+    """Return B of every code of `Observations.occluder` in one photo; the last row is that of an unknown surface."""
     normal = unit_vectors(observations.normal)
     bins = fibonacci_sphere(BINS)
     photo_mean = np.average(radiance, axis=0, weights=observations.weight)
@@ -93,12 +93,12 @@ def _mean_by_bin(
     return (count * mean + PSEUDO_COUNT * expected) / (count + PSEUDO_COUNT)
 
 
-def _received_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
+def _bounced_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
     """Return (1) at observations of one photo.
 
     The highlight is at least as wide as the spacing of the directions, as in `factorlib.light.visibility`.
     """
-    hit_code = observations.met
+    hit_code = observations.occluder
     # `bounced_light` selects only such observations
     assert observations.visibility is not None and hit_code is not None
     count = observations.visibility.shape[1]
@@ -116,7 +116,9 @@ def _received_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 
     code = np.where((hit_code == NO_OCCLUDER) | (hit_code >= unknown), unknown, hit_code).astype(np.int64)
     by_channel = [torch.from_numpy(surfaces[:, c]).float()[torch.from_numpy(code)] for c in range(3)]
     weights = [hidden * reflectance for reflectance in (cosine_weights(normal, directions), highlight)]
-    return np.column_stack([(weight * sent).sum(1).double().numpy() for weight in weights for sent in by_channel])
+    return np.column_stack(
+        [(weight * radiance).sum(1).double().numpy() for weight in weights for radiance in by_channel]
+    )
 
 
 def unit_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -101,14 +101,14 @@ def choose_effects(request: SolveRequest, state: SolveState) -> SolveState:
 
 def choose_tone(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose by held-out observations which lights get tone curves, and fit them."""
-    chosen = select_tone_curves(request.reliable_problem(state), state.fit, request.options, request.run.fit)
-    return state.with_fit(chosen.fit, tone=chosen.evidence)
+    selection = select_tone_curves(request.reliable_problem(state), state.fit, request.options, request.run.fit)
+    return state.with_fit(selection.fit, tone=selection.evidence)
 
 
 def choose_distances(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose by marginal likelihood which lights are at a finite distance, and fit their distances."""
-    chosen = select_distances(request.reliable_problem(state), state.fit, request.options, request.run.fit)
-    return state.with_fit(chosen.fit, distances=chosen.evidence)
+    selection = select_distances(request.reliable_problem(state), state.fit, request.options, request.run.fit)
+    return state.with_fit(selection.fit, distances=selection.evidence)
 
 
 def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
@@ -132,8 +132,8 @@ def fit_lights(request: SolveRequest, state: SolveState) -> SolveState:
 
 def choose_suns(request: SolveRequest, state: SolveState) -> SolveState:
     """Replace the brightest cells of a light by a sun where that explains its observations better."""
-    chosen = select_suns(request.light_problem(state), state.fit, request.run)
-    return msgspec.structs.replace(state, fit=chosen.fit, suns=chosen.evidence)
+    selection = select_suns(request.light_problem(state), state.fit, request.run)
+    return msgspec.structs.replace(state, fit=selection.fit, suns=selection.evidence)
 
 
 STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {

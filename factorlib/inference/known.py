@@ -31,7 +31,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
 from factorlib.inference.lights import Light, fibonacci_cells
 from factorlib.inference.materials import ROUGHNESS, Materials
-from factorlib.light.lobes import lobe_integral, squared_distances
+from factorlib.light.lobes import lobe_energy, squared_distances
 from factorlib.urm.observations import Observations
 
 START_CELLS = 400  # even cells at the start
@@ -130,7 +130,7 @@ def fit_known_light(
         for _ in range(ITERATIONS if number == SPLITTING_ROUNDS else ITERATIONS_BETWEEN):
             weight *= response.T @ (energy_of / (response @ weight)) / np.maximum(covered, LEAST_SOLID_ANGLE)[:, None]
         light = msgspec.structs.replace(light, weight=weight.astype(float))
-    return msgspec.structs.replace(light, fixed=covered >= LEAST_COVERAGE * lobe_integral(light.sharpness))
+    return msgspec.structs.replace(light, fixed=covered >= LEAST_COVERAGE * lobe_energy(light.sharpness))
 
 
 def light_from_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:
@@ -203,13 +203,13 @@ def extract_known(
     lights = {name: light_from_map(lat_long) for name, lat_long in maps.items()}
     for name, ball in declared.balls.items():
         m = number(ball.material)
-        of_photo = observations.photo == observations.photos.index(ball.photo)
+        photo_mask = observations.photo == observations.photos.index(ball.photo)
         pixels = balls[name].take(balls[name].material == m)
-        beside_ball = ~(of_photo & (observations.material == m))
-        if len(pixels) < LEAST_BALL_PIXELS or not (of_photo & beside_ball).any():
+        beside_ball = ~(photo_mask & (observations.material == m))
+        if len(pixels) < LEAST_BALL_PIXELS or not (photo_mask & beside_ball).any():
             fault = (
                 f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
-                f"and {(of_photo & beside_ball).sum()} observations of other objects"
+                f"and {(photo_mask & beside_ball).sum()} observations of other objects"
             )
             cure = (
                 f"the ball needs {LEAST_BALL_PIXELS} pixels, and the photo another object: "

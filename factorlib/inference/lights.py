@@ -25,14 +25,14 @@ from jaxtyping import Bool, Float, Int
 
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images import tone
-from factorlib.light.lobes import SUN, Lobes, lobe_integral
+from factorlib.light.lobes import SUN, Lobes, lobe_energy
 
 # Width of a cell in spacings.  Equal weights are a constant light to 2 % (RMS); wider cells blur a sun more than
 # materials do.
 WIDTH = 0.5
 PEAK = 1 / (2 * np.pi * WIDTH**2)  # weight of a cell of radiance 1
 SCALINGS = 5  # iterations for peaks: five make split cells constant to 3 % (RMS), more reach 2.7 % at best
-SUN_PEAK = np.pi / float(lobe_integral(np.array([SUN]))[0])
+SUN_PEAK = np.pi / float(lobe_energy(np.array([SUN]))[0])
 DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
 TONE_RANGE = (0.6, 1.7)  # range of the exponents of tone curves
 NEAR_BOUNDS = 0.8  # share of the logarithms of that range: exponents of cameras lie well within
@@ -146,7 +146,7 @@ class Light(msgspec.Struct, frozen=True):
     @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
         """Integral of each lobe over the sphere, in the illumination's radiance unit times steradians."""
-        return self.weight * lobe_integral(self.sharpness)[:, None]
+        return self.weight * lobe_energy(self.sharpness)[:, None]
 
     @property
     def mean_radiance(self) -> Float[np.ndarray, "3"]:

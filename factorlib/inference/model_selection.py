@@ -101,7 +101,7 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
         least: Threshold in standard errors.
 
     >>> same = Losses([np.array([1.0, 2.0, 3.0])], [np.array([0, 1, 2])])
-    >>> compare_models(same, same, CLEARLY_FOR).kept, compare_models(same, same, CLEARLY_AGAINST).kept
+    >>> compare_models(same, same, CLEARLY_FOR).accepted, compare_models(same, same, CLEARLY_AGAINST).accepted
     (False, True)
     """
     counts = np.array([len(values) for values in richer.values])
@@ -173,11 +173,11 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     if shadows == "auto" and not problem.none_held_out:
         plain, plain_losses = fit_best("no shadows", False, False, [fit])
         decision = compare_models(plain_losses, losses, CLEARLY_AGAINST)
-        if not decision.kept:
+        if not decision.accepted:
             return SolveState(plain, plain, decision)
     if bounces == "auto":
-        chosen = select_interreflection(sample, fit, run_fit)
-        return SolveState(chosen.fit, chosen.fit, decision, chosen.evidence[0])
+        selection = select_interreflection(sample, fit, run_fit)
+        return SolveState(selection.fit, selection.fit, decision, selection.evidence[0])
     return SolveState(fit, fit, decision, Decision(forced))
 
 
@@ -196,8 +196,8 @@ def select_interreflection(sample: JointProblem, start: Fit, run_fit: Fitting) -
     fits = [run_fit(phase, model, start, BOUNCE_SCHEDULE) for model in models]
     log_bayes_factor = (fits[0].value - fits[1].value) / 2
     decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
-    chosen = int(decision.kept)
-    return Selection(run_fit(phase, models[chosen], fits[chosen], AFTER_BOUNCES), [decision])
+    index = int(decision.accepted)
+    return Selection(run_fit(phase, models[index], fits[index], AFTER_BOUNCES), [decision])
 
 
 def _log_geometric_mean(losses: Losses) -> float:
@@ -232,14 +232,14 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
     evidence = []
     for k, light in enumerate(curved.point.lights):
         decision = compare_models(losses_without.one_light(k), losses_with.one_light(k), CLEARLY_FOR)
-        accepted = decision.kept and relative_gain(decision) > LEAST_TONE_GAIN and not light.implausible_tone
-        evidence.append(Decision(True) if curved_before[k] else msgspec.structs.replace(decision, kept=accepted))
-    if all(decision.kept for decision in evidence):
+        accepted = decision.accepted and relative_gain(decision) > LEAST_TONE_GAIN and not light.implausible_tone
+        evidence.append(Decision(True) if curved_before[k] else msgspec.structs.replace(decision, accepted=accepted))
+    if all(decision.accepted for decision in evidence):
         return Selection(curved, evidence)
-    if not any(decision.kept and not has for decision, has in zip(evidence, curved_before, strict=True)):
+    if not any(decision.accepted and not has for decision, has in zip(evidence, curved_before, strict=True)):
         return Selection(start, evidence)
     pairs = zip(curved.point.lights, start.point.lights, strict=True)
-    mixed = [pair[0 if decision.kept else 1] for pair, decision in zip(pairs, evidence, strict=True)]
+    mixed = [pair[0 if decision.accepted else 1] for pair, decision in zip(pairs, evidence, strict=True)]
     return Selection(run_fit("tone curves", sample, start.with_lights(mixed), TONE_SCHEDULE), evidence)
 
 
@@ -263,28 +263,30 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         return Selection(before, evidence)
     sample = comparison_sample(problem, options)
 
-    def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE) -> Fit:
+    def fit_with_curvatures(
+        curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE
+    ) -> Fit:
         """Return the fit with lights of these curvatures, by number of the light."""
         return run_fit("distances", sample, start.with_curvatures(curvatures), schedule)
 
     # each fit continues from the previous one: far away, then nearer and nearer
     fits = [before]
     for c in (0.0, *CURVATURES):
-        fits.append(fit_at(dict.fromkeys(candidates, c), fits[-1]))
+        fits.append(fit_with_curvatures(dict.fromkeys(candidates, c), fits[-1]))
     values = np.array([fit.light_values for fit in fits[1:]])
     log_bayes_factors = (values[0] - values[1:]) / 2
     likely = softmax(log_bayes_factors, axis=0).T @ CURVATURES
     factor = log_bayes_factors.max(0)
     near = {k: float(likely[k]) for k in candidates if factor[k] > VERY_STRONG}
     if near:
-        chosen = fit_at(near)
+        near_fit = fit_with_curvatures(near)
         alternatives = (dict.fromkeys(near, 0.0), near)
-        far_values, near_values = (fit_at(c, chosen, LIGHTS_ONLY).light_values for c in alternatives)
+        far_values, near_values = (fit_with_curvatures(c, near_fit, LIGHTS_ONLY).light_values for c in alternatives)
         factor = np.minimum(factor, (np.array(far_values) - near_values) / 2)
     for k in candidates:
         evidence[k] = Decision(bool(factor[k] > VERY_STRONG), log_bayes_factor=float(factor[k]))
-    curvatures = {k: c * near_share(factor[k]) for k, c in near.items() if evidence[k].kept}
-    return Selection(fit_at(curvatures) if curvatures else before, evidence)
+    curvatures = {k: c * near_share(factor[k]) for k, c in near.items() if evidence[k].accepted}
+    return Selection(fit_with_curvatures(curvatures) if curvatures else before, evidence)
 
 
 def near_share(log_bayes_factor: float) -> float:

@@ -59,14 +59,14 @@ def gather_observations(
         tick: Called after each file.
     """
 
-    def merged(path: Path) -> PhotoObservations:
+    def read_merged(path: Path) -> PhotoObservations:
         """Return the usable observations of one file, merged."""
         read = with_surface_normals(read_observations(path), surface)
         usable = usable_observations(read)
         tick()
         return PhotoObservations(merge(usable, degrees), len(read), len(read) - len(usable))
 
-    return list(spread(merged, files))
+    return list(spread(read_merged, files))
 
 
 def blocks_of_observations(
@@ -194,5 +194,5 @@ def held_out_by_cells(
         seed: Seed of the random choice.
     """
     names, number = np.unique(cell, return_inverse=True)
-    chosen = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]
-    return chosen & np.isin(material, material[~chosen])
+    is_held_out = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]
+    return is_held_out & np.isin(material, material[~is_held_out])

@@ -31,8 +31,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.inference.lights import TONE_RANGE, Light
 from factorlib.inference.likelihood import LightLikelihood, System, solve_cholesky
+from factorlib.inference.material_prior import MaterialPrior, PriorTerms, materials_from_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
-from factorlib.inference.priors import MaterialPrior, PriorTerms, materials_from_unknowns
 from factorlib.inference.problem import Spread
 
 FLOOR = 1e-9  # share of the largest diagonal entry that is added to every diagonal entry
@@ -195,24 +195,24 @@ class Descent(msgspec.Struct, frozen=True):
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        free = self.free & ~pushed_outward(state.theta.reshape(-1), -gradient)
+        free = self.free & ~outward_mask(state.theta.reshape(-1), -gradient)
         # H with D and the damping μ
         arrow = Arrow(state.systems, state.prior.hessian + hessian, free, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
         ends = np.cumsum([size, *(len(system.light_gradient) for system in state.systems)])[:-1]
 
-        def moved(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
+        def apply_step(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
             """Return θ and the lights after a step of all unknowns."""
-            of_materials, *of_lights = np.split(step, ends)
-            change = of_materials.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
+            material_step, *light_steps = np.split(step, ends)
+            change = material_step.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
             theta = (state.theta + change).clip(LOWER_BOUNDS, UPPER_BOUNDS)
             materials = materials_from_unknowns(theta)
-            steps = zip(state.likelihoods, of_lights, strict=True)
+            steps = zip(state.likelihoods, light_steps, strict=True)
             return theta, [old.with_point(step_light(old.light, step), materials) for old, step in steps]
 
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
             """Return (2) and half its gradient."""
-            theta, likelihoods = moved(step)
+            theta, likelihoods = apply_step(step)
             prior = self.prior.evaluate(theta)
             parts = list(self.spread(LightLikelihood.gradient, likelihoods))
             off = (theta - state.theta).reshape(-1)
@@ -224,15 +224,17 @@ class Descent(msgspec.Struct, frozen=True):
 
         def metric(slope: np.ndarray) -> np.ndarray:
             """Return H⁻¹ times a gradient."""
-            of_materials, *of_lights = np.split(slope, ends)
-            step, lights = arrow.solve(of_materials, of_lights)
+            material_slope, *light_slopes = np.split(slope, ends)
+            step, lights = arrow.solve(material_slope, light_slopes)
             return np.concatenate([step, *lights])
 
-        theta, likelihoods = moved(minimise_lbfgs(objective, ends[-1] + len(state.systems[-1].light_gradient), metric))
+        theta, likelihoods = apply_step(
+            minimise_lbfgs(objective, ends[-1] + len(state.systems[-1].light_gradient), metric)
+        )
         return likelihoods, theta
 
 
-def pushed_outward(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
+def outward_mask(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
     """Return a mask of the unknowns at a bound that a direction would push beyond it."""
     lower = (theta <= np.resize(LOWER_BOUNDS, theta.size)) & (direction < 0)
     upper = (theta >= np.resize(UPPER_BOUNDS, theta.size)) & (direction > 0)

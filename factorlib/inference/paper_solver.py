@@ -83,7 +83,9 @@ class PaperOptions(msgspec.Struct, frozen=True):
     seed: Seed = 0
 
 
-def solve(problem: JointProblem, materials: int, options: PaperOptions, report: EventReport = ignore_event) -> Solution:
+def solve_paper(
+    problem: JointProblem, materials: int, options: PaperOptions, report: EventReport = ignore_event
+) -> Solution:
     """Solve the problem as the paper does, in the gauge of `factorlib.inference.gauge`.
 
     The unknowns are those of the joint solver: materials 0 … `materials`−1 and one light per block.
@@ -122,9 +124,9 @@ def draw_subset(
 ) -> list[Int[np.ndarray, " _"]]:
     """Return `count` of all rows, drawn without replacement, as a list per block."""
     starts = np.cumsum([0, *map(len, rows)])
-    chosen = np.sort(random.choice(starts[-1], min(count, starts[-1]), replace=False))
+    drawn_rows = np.sort(random.choice(starts[-1], min(count, starts[-1]), replace=False))
     return [
-        block_rows[chosen[(chosen >= a) & (chosen < b)] - a]
+        block_rows[drawn_rows[(drawn_rows >= a) & (drawn_rows < b)] - a]
         for block_rows, a, b in zip(rows, starts[:-1], starts[1:], strict=True)
     ]
 
@@ -196,12 +198,12 @@ class PaperObjective:
 
     def unpack(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
         """Return (diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
-        of_materials, *of_lights = torch.split(x, self.sizes)
-        bounded = torch.sigmoid(of_materials.reshape(-1, 7))
+        material_part, *light_parts = torch.split(x, self.sizes)
+        bounded = torch.sigmoid(material_part.reshape(-1, 7))
         (low, high) = ROUGHNESS
         (least, most) = LOG_SHARPNESS
         lights: list[tuple[Tensor, ...]] = []
-        for part in of_lights:
+        for part in light_parts:
             rows = part[: 7 * self.options.lobes].reshape(-1, 7)
             log_exposures = part[7 * self.options.lobes :]
             axis = torch.nn.functional.normalize(rows[:, :3], dim=1)

@@ -65,8 +65,8 @@ def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions,
             break
         # begin with equal radiance of all cells that replace one, as `split` makes it
         pairs = zip(fit.point.lights, finer, strict=True)
-        chosen = [pair[int(split)] for pair, split in zip(pairs, supported, strict=True)]
-        fit = run.fit_and_report(phase, sample, fit.with_lights(chosen), AFTER_SPLITTING)
+        selected = [pair[int(split)] for pair, split in zip(pairs, supported, strict=True)]
+        fit = run.fit_and_report(phase, sample, fit.with_lights(selected), AFTER_SPLITTING)
         if number == 0 and sample.fitted_loss(fit.point) < SMALL_LOSS:
             observations = OBSERVATION_FACTOR * observations
             sample = problem.subsample(observations, options.seed)

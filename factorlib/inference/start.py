@@ -35,7 +35,7 @@ from factorlib.inference.lights import TONE_RANGE, Light, UnitLobes, fibonacci_c
 from factorlib.inference.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.results.solution import Earlier
+from factorlib.results.solution import EarlierSolution
 
 log = logging.getLogger("factorlib.inference")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
@@ -166,8 +166,8 @@ def insert_known(point: Point, problem: JointProblem) -> Point:
             if known_light := known_lights.get(i):
                 scale = (brighter[i] - factor).mean() * known_light.scale_free - np.log(problem.blocks[i].unit)
                 weight = known_light.weight * np.exp(scale)
-                held = {"fixed": known_light.fixed, "scale_free": known_light.scale_free}
-                parts = {"axis": known_light.axis, "log_sharpness": known_light.log_sharpness, **held}
+                constraints = {"fixed": known_light.fixed, "scale_free": known_light.scale_free}
+                parts = {"axis": known_light.axis, "log_sharpness": known_light.log_sharpness, **constraints}
             if names[i] in known.exposures:
                 parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_fixed": True}
             lights[i] = msgspec.structs.replace(lights[i], weight=weight, **parts)
@@ -179,7 +179,7 @@ def log_mean_radiance(light: Light) -> Float[np.ndarray, "3"]:
     return np.log(np.maximum(light.mean_radiance, LEAST_RADIANCE))
 
 
-def start_from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
+def start_from_earlier(earlier: EarlierSolution, names: Sequence[str]) -> Start:
     """Return the start from an earlier solution, for materials called `names`.
 
     Lights of the earlier solution keep their cells.
@@ -187,7 +187,7 @@ def start_from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
     return lambda problem, cells: [initial_fit(point_from_earlier(problem, earlier, names, cells))]
 
 
-def with_earlier_decisions(options: SolveOptions, earlier: Earlier) -> SolveOptions:
+def with_earlier_decisions(options: SolveOptions, earlier: EarlierSolution) -> SolveOptions:
     """Return the choices with shadows and interreflection as decided before.
 
     A decision counts only if both alternatives had been compared.
@@ -277,7 +277,7 @@ def refine_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
     return fit.with_lights(lights)
 
 
-def point_from_earlier(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
+def point_from_earlier(problem: JointProblem, earlier: EarlierSolution, names: Sequence[str], cells: int) -> Point:
     """Return the point from which a solve with an earlier solution starts.
 
     Each component of the earlier gauge is brought to the scale of `mean_albedo` by a geometric mean.  The mean is over
@@ -316,7 +316,7 @@ def point_from_earlier(problem: JointProblem, earlier: Earlier, names: Sequence[
     return Point(materials, lights)
 
 
-def light_from_earlier(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"]) -> Light:
+def light_from_earlier(constant: Illumination, earlier: EarlierSolution, factor: Float[np.ndarray, "3"]) -> Light:
     """Return the earlier light of a block, in the block's unit and the start's gauge.
 
     The constant light is returned if there is no earlier one, or if that explains the block worse.  A photo that the

@@ -70,7 +70,7 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
     with_suns = problem.illuminations(trial.point)
     for k in changed:
         evidence[k] = accept_sun(without_suns[k], with_suns[k])
-    accepted = [k for k in changed if evidence[k].kept]
+    accepted = [k for k in changed if evidence[k].accepted]
     if accepted:
         # a wide lobe in place of each accepted sun
         replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
@@ -80,10 +80,10 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
         wide_fit = run.fit_and_report("suns", problem, start, AROUND_SUNS)
         for k, with_wide_lobe in zip(accepted, problem.illuminations(wide_fit.point), strict=True):
             decision = compare_illuminations(with_wide_lobe, with_suns[k], CLEARLY_AGAINST)
-            evidence[k] = evidence[k] if decision.kept else decision
-    fits = [trial if decision.kept else fit for decision in evidence]
-    lights = [chosen.point.lights[k] for k, chosen in enumerate(fits)]
-    hyperparameters = [chosen.hyperparameters[k] for k, chosen in enumerate(fits)]
+            evidence[k] = evidence[k] if decision.accepted else decision
+    fits = [trial if decision.accepted else fit for decision in evidence]
+    lights = [light_fit.point.lights[k] for k, light_fit in enumerate(fits)]
+    hyperparameters = [light_fit.hyperparameters[k] for k, light_fit in enumerate(fits)]
     return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 
@@ -147,7 +147,7 @@ def accept_sun(cells: Illumination, sun: Illumination) -> Decision:
     total = sun.light.energy.sum(0)
     strong = energy.sum() >= LEAST_SUN_SHARE * total.sum()
     warm = energy[2] * total[0] <= total[2] * energy[0]
-    return msgspec.structs.replace(evidence, kept=bool(evidence.kept and clear and strong and warm))
+    return msgspec.structs.replace(evidence, accepted=bool(evidence.accepted and clear and strong and warm))
 
 
 def _grid_around(z: Float[np.ndarray, "3"], radius: float, step: float) -> Float[np.ndarray, "q 3"]:

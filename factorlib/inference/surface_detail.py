@@ -50,10 +50,10 @@ from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import InitialFit, Start, refine_cells
 from factorlib.inference.surface_turns import (
-    Attached,
     Detail,
     LightTerms,
     Stiffness,
+    SurfacePositions,
     Surfaces,
     linearise_light,
     solve_detail,
@@ -127,7 +127,7 @@ def decide_detail(scores: PhotoScores, reference: PhotoScores, held_out: float, 
         likelihood: Threshold of the marginal likelihood, in standard errors.
     """
     evidence = compare_models(reference.losses, scores.losses, held_out)
-    return msgspec.structs.replace(evidence, kept=evidence.kept and scores.gain_over(reference) > likelihood)
+    return msgspec.structs.replace(evidence, accepted=evidence.accepted and scores.gain_over(reference) > likelihood)
 
 
 class DetailTrial(msgspec.Struct, frozen=True):
@@ -144,7 +144,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
     problem: JointProblem
     fit: Fit
     surfaces: Surfaces
-    attached: list[Attached]
+    attached: list[SurfacePositions]
     prior: LightPrior
 
     def with_detail(self, detail: Detail) -> JointProblem:
@@ -376,16 +376,18 @@ class DetailSearch(msgspec.Struct, frozen=True):
             return set(names)
         restricted = [(name, [self.trial.restrict_turns(detail, {name}) for detail in turned]) for name in names]
         scores = {name: self.trial.score_photos(details, self.tick, self.plain) for name, details in restricted}
-        return {name for name, mesh_scores in scores.items() if decide_detail(mesh_scores, self.plain, 0.0, 0.0).kept}
+        return {
+            name for name, mesh_scores in scores.items() if decide_detail(mesh_scores, self.plain, 0.0, 0.0).accepted
+        }
 
 
 def estimate_surface(
     problem: JointProblem,
     surfaces: Surfaces,
-    attached: list[Attached],
+    attached: list[SurfacePositions],
     start: Start,
     seed: int = 0,
-    report: ProgressReport = lambda share, what: None,
+    report: ProgressReport = lambda share, activity: None,
 ) -> SurfaceEstimate:
     """Return the detail of the meshes, if photos gain from detail that was estimated without them.
 
@@ -408,25 +410,25 @@ def estimate_surface(
     scores = trial.score_photos([plain] * photos, tick)
     search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), scores, tick)
     turned, movable = search.select_turns()
-    chosen = (
-        turned if turned.evidence.kept else StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
-    )
-    candidates = [Stiffness(chosen.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
+    unturned = StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
+    selected = turned if turned.evidence.accepted else unturned
+    candidates = [Stiffness(selected.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
     nodes = trial.shared_nodes & surfaces.node_mask(movable)
-    painted = search.select_stiffness(candidates, chosen.scores, (0.0, CLEARLY_FOR), nodes)
-    chosen = painted if painted.evidence.kept else chosen
-    if not (turned.evidence.kept or painted.evidence.kept):
+    painted = search.select_stiffness(candidates, selected.scores, (0.0, CLEARLY_FOR), nodes)
+    selected = painted if painted.evidence.accepted else selected
+    if not (turned.evidence.accepted or painted.evidence.accepted):
         return SurfaceEstimate(initial, turned.evidence, painted.evidence)
-    gains = dict(zip(trial.names, (scores.values - chosen.scores.values).tolist(), strict=True))
-    detail = search.fit_all_photos(chosen.stiffness, movable, pieces, seed)
-    displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.kept else {}
+    gains = dict(zip(trial.names, (scores.values - selected.scores.values).tolist(), strict=True))
+    detail = search.fit_all_photos(selected.stiffness, movable, pieces, seed)
+    displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.accepted else {}
     displacements = {name: displacement for name, displacement in displacements.items() if name in movable}
-    factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.kept else {}
-    return SurfaceEstimate(initial, turned.evidence, painted.evidence, chosen.stiffness, gains, displacements, factors)
+    factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.accepted else {}
+    decisions = turned.evidence, painted.evidence
+    return SurfaceEstimate(initial, *decisions, selected.stiffness, gains, displacements, factors)
 
 
 def fit_trial(
-    problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[Attached]], tick: Tick
+    problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[SurfacePositions]], tick: Tick
 ) -> tuple[DetailTrial, InitialFit]:
     """Return the problem without detail with its fit, and the fit on few cells.
 
@@ -460,15 +462,15 @@ class ProgressSections(msgspec.Struct, frozen=True):
 
     report: ProgressReport
 
-    def section(self, begin: float, end: float, number: int, what: str) -> Tick:
+    def section(self, begin: float, end: float, number: int, activity: str) -> Tick:
         """Return a function that reports one more completed unit of work at each call.
 
         Args:
             begin: Share that is complete before.
             end: Share that is complete afterwards.
             number: Number of units.
-            what: Activity.
+            activity: Activity.
         """
-        self.report(begin, what)
-        done = count(1)
-        return lambda *_: self.report(begin + (end - begin) * min(next(done) / number, 1.0), what)
+        self.report(begin, activity)
+        completed = count(1)
+        return lambda *_: self.report(begin + (end - begin) * min(next(completed) / number, 1.0), activity)

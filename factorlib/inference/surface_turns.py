@@ -36,7 +36,7 @@ from factorlib.inference.blocks import FIT_LOSS, Block
 from factorlib.inference.fit import Hyperparameters, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.light.prior import LightPrior
-from factorlib.meshes.mesh import scaled
+from factorlib.meshes.mesh import scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh
 from factorlib.results.poses import ObjectPose
 
@@ -48,7 +48,7 @@ CG_TOLERANCE = 3e-3  # relative tolerance of conjugate gradients
 CG_ITERATIONS = 150  # most iterations of conjugate gradients
 
 
-class Attached(msgspec.Struct, frozen=True):
+class SurfacePositions(msgspec.Struct, frozen=True):
     """Positions of n observations on the surface.
 
     Attributes:
@@ -61,11 +61,11 @@ class Attached(msgspec.Struct, frozen=True):
     share: Float[np.ndarray, "n 3"]
     frame: Float[np.ndarray, "n 3 3"]
 
-    def take(self, rows: np.ndarray) -> Attached:
+    def take(self, rows: np.ndarray) -> SurfacePositions:
         """Return the observations `rows` alone."""
-        return Attached(self.node[rows], self.share[rows], self.frame[rows])
+        return SurfacePositions(self.node[rows], self.share[rows], self.frame[rows])
 
-    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> Attached:
+    def rotate(self, rotation: Float[np.ndarray, "3 3"]) -> SurfacePositions:
         """Return the same positions for normals in another frame; `rotation` turns the present one into it."""
         return msgspec.structs.replace(self, frame=rotation @ self.frame)
 
@@ -102,9 +102,11 @@ class Attached(msgspec.Struct, frozen=True):
         return np.where(np.sum(turned * view, 1, keepdims=True) < LEAST_VIEW_COSINE, normal, turned)
 
 
-def concatenate_attached(parts: Sequence[Attached]) -> Attached:
+def concatenate_positions(parts: Sequence[SurfacePositions]) -> SurfacePositions:
     """Return the observations of several parts, one after the other."""
-    return Attached(*(np.concatenate([getattr(part, name) for part in parts]) for name in Attached.__struct_fields__))
+    return SurfacePositions(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in SurfacePositions.__struct_fields__)
+    )
 
 
 class Surfaces(msgspec.Struct, frozen=True):
@@ -128,7 +130,7 @@ class Surfaces(msgspec.Struct, frozen=True):
         return csr_array(block_diag([mesh.laplacian() for mesh in self.meshes.values()]))
 
     def displacements(
-        self, turn: Float[np.ndarray, "v 3"], attached: Sequence[Attached]
+        self, turn: Float[np.ndarray, "v 3"], attached: Sequence[SurfacePositions]
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Return the displacement of each mesh that best explains the turns of its nodes, in extents.
 
@@ -148,7 +150,7 @@ class Surfaces(msgspec.Struct, frozen=True):
     def turns_from_displacements(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
         """Return the turns that displacements imply; a mesh without a displacement has none."""
         zero = {name: np.zeros((mesh.nodes, 3)) for name, mesh in self.meshes.items()}
-        turns = {name: self.meshes[name].turn_of(displacement) for name, displacement in displacements.items()}
+        turns = {name: self.meshes[name].normal_change(displacement) for name, displacement in displacements.items()}
         return np.vstack(list((zero | turns).values()))
 
     def node_mask(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
@@ -162,7 +164,7 @@ def attach_pixels(
     camera: Camera,
     objects: Mapping[str, tuple[str, ObjectPose]],
     surfaces: Surfaces,
-) -> Attached:
+) -> SurfacePositions:
     """Return the nodes under pixels (x, y), in the camera's frame.
 
     Args:
@@ -183,7 +185,7 @@ def attach_pixels(
         rows = np.flatnonzero(object_number == number)
         fine = surfaces.meshes[mesh]
         scale = np.array(entry.scale)
-        solid = scaled(fine.mesh, entry.scale)
+        solid = scale_mesh(fine.mesh, entry.scale)
         # first hits of the pixels' rays, their triangles and barycentric coordinates
         hits = Caster(solid).cast_along(along[rows], entry.pose)
         rows = rows[hits.face >= 0]
@@ -195,7 +197,7 @@ def attach_pixels(
         toward = face_normals(solid, face) @ entry.pose.rotation.T
         side = np.where(np.sum(toward * along[rows], 1) > 0, -1.0, 1.0)
         frame[rows] = side[:, None, None] * entry.pose.rotation * (scale.mean() / scale)
-    return Attached(node, share, frame)
+    return SurfacePositions(node, share, frame)
 
 
 class Detail(msgspec.Struct, frozen=True):
@@ -209,7 +211,7 @@ class Detail(msgspec.Struct, frozen=True):
     turn: Float[np.ndarray, "v 3"]
     log_factor: Float[np.ndarray, " v"]
 
-    def apply_to(self, block: Block, attached: Attached) -> Block:
+    def apply_to(self, block: Block, attached: SurfacePositions) -> Block:
         """Return the block, which has no detail, with this detail."""
         normal = attached.turn_normals(block.normal, block.view, self.turn)
         return block.on_surface(normal, attached.factor(self.log_factor))
@@ -281,7 +283,11 @@ class LightTerms(msgspec.Struct, frozen=True, dict=True):
 
 
 def linearise_light(
-    illumination: Illumination, hyperparameters: Hyperparameters, prior: LightPrior, attached: Attached, nodes: int
+    illumination: Illumination,
+    hyperparameters: Hyperparameters,
+    prior: LightPrior,
+    attached: SurfacePositions,
+    nodes: int,
 ) -> LightTerms:
     """Linearise one light at its block's normals and detail.
 

@@ -48,9 +48,9 @@ from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.joint_solver import LIGHT_OBSERVATION_FACTOR
 from factorlib.inference.likelihood import System, cholesky_factor, cholesky_inverse, solve_cholesky
+from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.priors import material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
 from factorlib.light.prior import LightPrior, read_light_prior
@@ -142,7 +142,7 @@ class Posterior:
         by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
         # S and s_k, from logarithms to reflectances
         precision, scores = information(self.systems(with_scores=True), len(by_log))
-        scores = [of_light * by_log for of_light in scores]
+        scores = [light_scores * by_log for light_scores in scores]
         variance = largest_variance(precision * np.outer(by_log, by_log), scores, materials, self.problem)
         deviation = residual_deviation(self.problem, self.fit.point)
         variance += ((deviation * MODEL_ERROR * values) ** 2).reshape(-1)

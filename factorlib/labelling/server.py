@@ -28,10 +28,10 @@ from PIL import Image
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal, file_exists
-from factorlib.dataset.read import FILE, UNKNOWN
+from factorlib.dataset.read_dataset import FILE, UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
-from factorlib.images.photo import decoded, open_photo
+from factorlib.images.photo import decode_photo, open_photo
 from factorlib.images.picture import PALETTE, picture, png_bytes
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.labels.grow import grow
@@ -88,12 +88,12 @@ class MaskSet:
         refuse = Refusal(self.yaml, self.folder)
         self.materials = spec.materials
         self.photos = spec.photos
-        refuse.once("photos", (photo.name for photo in self.photos), "photo")
+        refuse.check_distinct("photos", (photo.name for photo in self.photos), "photo")
         for index, photo in enumerate(self.photos):
             key = f"photos[{index}].image"
             mask = f"masks/{photo.name}.png" if photo.masks == UNKNOWN else photo.masks
-            refuse.path(key, photo.image, IMAGES)
-            refuse.path(f"photos[{index}].masks", mask, (".png",), must_exist=False)
+            refuse.check_path(key, photo.image, IMAGES)
+            refuse.check_path(f"photos[{index}].masks", mask, (".png",), must_exist=False)
             self.files.append((self.folder / mask).resolve())
             self.sizes.append(open_photo(self.folder / photo.image, key).size)
             check_pixels(self.sizes[-1], MOST_MEGAPIXELS, self.folder / photo.image, key)
@@ -102,7 +102,7 @@ class MaskSet:
     def _picture(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """Return a photo as displayed, sRGB-encoded; a linear one is exposed."""
         path = self.folder / self.photos[index].image
-        photo = decoded(open_photo(path), self.photos[index].encoding, 1, path)
+        photo = decode_photo(open_photo(path), self.photos[index].encoding, 1, path)
         return picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
 
     def read(self, index: int) -> tuple[UInt8[np.ndarray, "h w"], str]:

@@ -51,8 +51,8 @@ def grow(
     x0, y0, x1, y1 = box
     guess, sure = _guess(box, fill, label, sure)
     result = np.where(sure, label, guess)
-    beside = max(4, round(BESIDE * max(x1 - x0, y1 - y0)))
-    part = np.s_[max(0, y0 - beside) : y1 + beside, max(0, x0 - beside) : x1 + beside]
+    margin = max(4, round(BESIDE * max(x1 - x0, y1 - y0)))
+    part = np.s_[max(0, y0 - margin) : y1 + margin, max(0, x0 - margin) : x1 + margin]
     pixels = pixels[part]
     label = guess[part]
     sure = sure[part]
@@ -118,7 +118,7 @@ def _walk(
     # system of the unknown pixels, with the diagonal as preconditioner
     rows = laplacian[~known]
     system = rows[:, ~known] + PRIOR * sparse.eye_array((~known).sum())
-    beside = rows[:, known]
+    coupling = rows[:, known]
     scale = sparse.diags_array(1 / system.diagonal())
     bins = np.ravel_multi_index(tuple((colour.T * (BINS - 1)).round().astype(int)), (BINS,) * 3)
     chances = np.empty((len(kinds), label.size))
@@ -132,7 +132,7 @@ def _walk(
         prior /= prior.sum(axis=0)
         for k, kind in enumerate(kinds):
             chances[k, known] = current[known] == kind
-            right = PRIOR * prior[k, ~known] - beside @ chances[k, known]
+            right = PRIOR * prior[k, ~known] - coupling @ chances[k, known]
             chances[k, ~known], _ = cg(system, right, rtol=1e-3, M=scale)
         current = kinds[chances.argmax(axis=0)]
         learnt = np.ones_like(known)

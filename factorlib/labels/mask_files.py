@@ -255,17 +255,20 @@ def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
     """Return the image entry of the same path, or else of the same file name."""
     base = PurePosixPath(image).name
     bases = [PurePosixPath(entry.file_name.replace("\\", "/")).name for entry in coco.images]
-    same = [entry for entry in coco.images if PurePosixPath(entry.file_name) == PurePosixPath(image)]
-    same = same or [entry for entry, name in zip(coco.images, bases) if name == base]
-    if not same:
+    entries = [entry for entry in coco.images if PurePosixPath(entry.file_name) == PurePosixPath(image)]
+    entries = entries or [entry for entry, name in zip(coco.images, bases) if name == base]
+    if not entries:
         raise InputError(
             f"the COCO file has no image {base!r}", file=path, key="images", cure=did_you_mean(base, bases)
         )
-    if len(same) > 1:
+    if len(entries) > 1:
         raise InputError(
-            f"has {len(same)} images {base!r}", file=path, key="images", cure=f"keep one, or call one {image!r}"
+            f"has {len(entries)} images {base!r}",
+            file=path,
+            key="images",
+            cure=f"keep one, or call one {image!r}",
         )
-    return same[0]
+    return entries[0]
 
 
 def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: str) -> tuple[list, float]:

@@ -54,7 +54,7 @@ def lattice_of_lobes(
         nodes: Function of a sharpness that returns θ from the top [h, g], φ from the left edge [w, g] and weights [g].
     """
     result = np.zeros((height, width, 3))
-    lobes = lobes.turned(YUP_FROM_CAMERA)
+    lobes = lobes.rotate(YUP_FROM_CAMERA)
     row, column = lat_long_of_direction(lobes.axis)
     bright = lobes.weight.any(axis=1)
     for theta, phi, sharpness, weight in zip(

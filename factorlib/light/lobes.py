@@ -31,11 +31,11 @@ class Lobes(msgspec.Struct, frozen=True):
     def __len__(self) -> int:
         return len(self.sharpness)
 
-    def turned(self, rotation: Float[np.ndarray, "3 3"]) -> Lobes:
+    def rotate(self, rotation: Float[np.ndarray, "3 3"]) -> Lobes:
         """Return the same light in another frame, `rotation` = new_from_old."""
         return Lobes(self.axis @ np.asarray(rotation).T, self.sharpness, self.weight)
 
-    def scaled(self, factor: float | Float[np.ndarray, "3"]) -> Lobes:
+    def scale(self, factor: float | Float[np.ndarray, "3"]) -> Lobes:
         """Return the light times `factor`, a number or one per channel."""
         return Lobes(self.axis, self.sharpness, self.weight * np.asarray(factor))
 
@@ -55,7 +55,7 @@ class Lobes(msgspec.Struct, frozen=True):
     @property
     def energy(self) -> Float[np.ndarray, "3"]:
         """Integral of the light over the sphere, radiance × steradian."""
-        return lobe_integral(self.sharpness) @ self.weight
+        return lobe_energy(self.sharpness) @ self.weight
 
 
 def squared_distances(directions: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "n p"]:
@@ -63,10 +63,10 @@ def squared_distances(directions: Float[np.ndarray, "n 3"], axes: Float[np.ndarr
     return sum((directions[:, None, k] - axes[None, :, k]) ** 2 for k in range(3))
 
 
-def lobe_integral(sharpness: float | Float[np.ndarray, "*p"]) -> Float[np.ndarray, "*p"]:
+def lobe_energy(sharpness: float | Float[np.ndarray, "*p"]) -> Float[np.ndarray, "*p"]:
     """Return ∫ exp(λ(ω·z − 1)) dω over the sphere, steradian.
 
-    >>> (lobe_integral(np.array([0.0, 1e-12, 1e6])) / np.pi).round(9).tolist()
+    >>> (lobe_energy(np.array([0.0, 1e-12, 1e6])) / np.pi).round(9).tolist()
     [4.0, 4.0, 2e-06]
     """
     sharpness = np.asarray(sharpness, dtype=float)

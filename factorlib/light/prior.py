@@ -99,8 +99,8 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         The directions may be in any frame.
         """
-        alike = correlation(angles(directions), np.radians(self.decay_deg[k]))
-        return self.variance[k] * alike + self.level[k] + self.nugget[k] * np.eye(len(directions))
+        correlations = correlation(angles(directions), np.radians(self.decay_deg[k]))
+        return self.variance[k] * correlations + self.level[k] + self.nugget[k] * np.eye(len(directions))
 
     def precision(
         self, directions: Float[np.ndarray, "p 3"], factors: Sequence[float] = (1.0, 1.0, 1.0)

@@ -1,1 +1,1 @@
-"""Meshes: readers of files that yield labelled triangles with smooth normals, and a writer of PLY."""
+"""Meshes: `read_mesh` reads labelled triangles with smooth normals, `ply_stl_off` writes PLY."""

@@ -52,7 +52,7 @@ def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
             decoded = load(content, resolver=_BufferFiles(header, path, limits), skip_materials=True)["geometry"]
             primitives = [each for mesh in header.meshes for each in mesh.primitives if each.mode in DECODED]
             arrays = {id(each): array for each, array in zip(primitives, decoded.values(), strict=True)}
-            return _joined([part for part, size in zip(parts, sizes) if size[1]], arrays, header)
+            return _join_primitives([part for part, size in zip(parts, sizes) if size[1]], arrays, header)
     except (LookupError, AssertionError) as error:
         fault = f"its header names a node, an array or a part of a buffer that the file does not have ({error!r})"
         raise InputError(fault, file=path, cure=CURE) from error
@@ -164,7 +164,7 @@ def _size(primitive: Primitive, header: GltfHeader, path: Path) -> tuple[int, in
     return vertices, corners.count // 3 if primitive.mode == TRIANGLES else max(corners.count - 2, 0)
 
 
-def _joined(parts: list[Part], arrays: dict[int, dict], header: GltfHeader) -> TriangleSoup:
+def _join_primitives(parts: list[Part], arrays: dict[int, dict], header: GltfHeader) -> TriangleSoup:
     """Join all primitives in the scene's frame; normals transform by the cofactors of the linear part.
 
     Args:

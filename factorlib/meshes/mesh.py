@@ -51,11 +51,11 @@ class Mesh(msgspec.Struct, frozen=True):
         return float(np.linalg.norm(self.vertices[np.unique(self.faces)] - self.centre, axis=1).max())
 
 
-def scaled(mesh: Mesh, factors: Sequence[float]) -> Mesh:
+def scale_mesh(mesh: Mesh, factors: Sequence[float]) -> Mesh:
     """Scale the mesh's axes by `factors` > 0, about its origin; normals stay perpendicular to the surface.
 
     >>> tilted = Mesh(np.eye(3), np.array([[0, 1, 2]]), np.ones((3, 3)) / 3**0.5, np.array([1]))
-    >>> (scaled(tilted, (1, 1, 0.5)).normals[0] * 6**0.5).round(9).tolist()
+    >>> (scale_mesh(tilted, (1, 1, 0.5)).normals[0] * 6**0.5).round(9).tolist()
     [1.0, 1.0, 2.0]
     """
     along_axes = np.asarray(factors, dtype=float)
@@ -117,7 +117,7 @@ def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndar
     return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))
 
 
-def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[np.ndarray, " v"]:
+def weld_vertices(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[np.ndarray, " v"]:
     """Return the number of each vertex's position, equal for vertices closer than about `tolerance` × the extent."""
     low = vertices.min(axis=0)
     extent = float((vertices.max(axis=0) - low).max()) or 1.0
@@ -125,7 +125,7 @@ def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[n
     return np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def consistently_wound(
+def find_flipped_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Bool[np.ndarray, " f"], bool]:
     """Find the faces to flip so that neighbours agree, and whether the surface is open.
@@ -147,19 +147,19 @@ def consistently_wound(
     b = second // 3
     has_border = bool((counts == 1).any())
     # graph of orientations: node f is face f unchanged, node f + count is face f flipped
-    other = np.where(ends[first, 0] != ends[second, 0], 0, count)  # they agree if they run in opposite directions
+    offset = np.where(ends[first, 0] != ends[second, 0], 0, count)  # they agree if they run in opposite directions
     rows = np.r_[a, a + count]
-    columns = np.r_[b + other, b + count - other]
+    columns = np.r_[b + offset, b + count - offset]
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
     _, part = connected_components(graph, directed=False)
-    as_it_is = part[:count]
+    unflipped = part[:count]
     flipped = part[count:]
     # area, or signed volume, that each component keeps less that which it flips
     area = area_vectors(vertices, faces)
     volume = np.einsum("fd,fd->f", vertices[faces].mean(axis=1) - vertices[faces[:, 0]].mean(axis=0), area)
     gain = np.linalg.norm(area, axis=1) if has_border else volume
-    total = np.bincount(as_it_is, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
-    return (total[as_it_is] < 0) & (as_it_is != flipped), has_border
+    total = np.bincount(unflipped, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
+    return (total[unflipped] < 0) & (unflipped != flipped), has_border
 
 
 def corner_normals(
@@ -194,16 +194,16 @@ def corner_normals(
     # for each corner, the weighted sum over the corners at its vertex within the crease angle
     for group in _chunks(counts.astype(np.int64) ** 2):
         mine, theirs = _pairs(starts[group], counts[group])
-        own = normal[order[mine] // 3]
+        face_normal = normal[order[mine] // 3]
         other_normals = normal[order[theirs] // 3]
-        share = weight[order[theirs]] * (np.einsum("pd,pd->p", own, other_normals) >= threshold - 1e-12)
+        share = weight[order[theirs]] * (np.einsum("pd,pd->p", face_normal, other_normals) >= threshold - 1e-12)
         low = starts[group][0]
         high = starts[group][-1] + counts[group][-1]
         summed = [np.bincount(mine - low, share * other_normals[:, d], high - low) for d in range(3)]
         result[order[low:high]] = np.stack(summed, axis=1)
     length = np.linalg.norm(result, axis=1, keepdims=True)
-    own = np.repeat(normal, 3, axis=0)
-    return np.where(length > 1e-12, result / np.maximum(length, 1e-300), own).reshape(-1, 3, 3)
+    face_normal = np.repeat(normal, 3, axis=0)
+    return np.where(length > 1e-12, result / np.maximum(length, 1e-300), face_normal).reshape(-1, 3, 3)
 
 
 def _pairs(starts: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -77,8 +77,8 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
         columns[name], offset = _columns(content, offset, order, count, properties)
     # corners of the faces: the list of a known name, or the only one
     faces = columns.get("face", {})
-    chosen = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
-    values, sizes = faces[chosen] if chosen else (np.empty(0), np.zeros(0, np.int64))
+    corner_property = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
+    values, sizes = faces[corner_property] if corner_property else (np.empty(0), np.zeros(0, np.int64))
     limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
     whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
     if not whole or ((corners := values.astype(np.int64)) != values).any():

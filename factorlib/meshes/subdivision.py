@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from factorlib.meshes.mesh import Mesh, area_vectors, welded
+from factorlib.meshes.mesh import Mesh, area_vectors, weld_vertices
 
 LONGEST = 0.04  # longest edge after subdivision, in units of the mesh's extent
 LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the gradient's
@@ -49,12 +49,12 @@ def subdivide(mesh: Mesh, longest: float) -> Mesh:
         labels = [label[~too_long.any(1)]]
         # rotate the corners of each triangle so that its long edges come first, then split it
         for long_edges, pieces in PIECES.items():
-            chosen = count == long_edges
-            first = too_long[chosen].argmax(1) if long_edges == 1 else (too_long[chosen].argmin(1) + 1) % 3
+            selected = count == long_edges
+            first = too_long[selected].argmax(1) if long_edges == 1 else (too_long[selected].argmin(1) + 1) % 3
             turn = (first[:, None] + np.arange(3)) % 3
-            corners = np.hstack([np.take_along_axis(table[chosen], turn, 1) for table in (faces, middle)])
+            corners = np.hstack([np.take_along_axis(table[selected], turn, 1) for table in (faces, middle)])
             parts.append(corners[:, pieces].reshape(-1, 3))
-            labels.append(np.repeat(label[chosen], len(pieces)))
+            labels.append(np.repeat(label[selected], len(pieces)))
         faces = np.vstack(parts)
         label = np.concatenate(labels)
 
@@ -125,7 +125,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         values = np.stack(slopes, axis=1)  # [triangle, corner, axis]
         return [csr_array((values[..., a].reshape(-1), (rows, self.faces.reshape(-1))), shape) for a in range(3)]
 
-    def turn_of(self, displacement: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+    def normal_change(self, displacement: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
         """Return −∇d at nodes, the change of normals by a displacement d in units of the extent."""
         # operator that averages over the triangles about each node, weighted by area, [v, f]
         count = len(self.faces)
@@ -134,23 +134,26 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         mean = csr_array(diags_array(1 / np.maximum(np.asarray(weight.sum(1)).reshape(-1), 1e-300)) @ weight)
         return -np.stack([mean @ (slope @ displacement) for slope in self.gradients()], axis=1)
 
-    def displacement(self, turn: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    def displacement(
+        self, turn: Float[np.ndarray, "v 3"], node_weight: Float[np.ndarray, " v"]
+    ) -> Float[np.ndarray, " v"]:
         """Fit the displacement along the normals whose normals n' = n − ∇d are nearest to the given ones.
 
         This is least squares over triangles, weighted by area (Poisson's equation). `turn` is n' − n at nodes, in the
-        mesh's frame; `seen` is the weight of each node's turn, from 0 to 1. The result is in units of the extent.
+        mesh's frame; `node_weight` is the weight of each node's turn, from 0 to 1. The result is in units of the
+        extent.
         """
         slopes = self.gradients()
         areas = self.areas
-        wanted = turn[self.faces].mean(1)
-        weight = areas * np.maximum(seen[self.faces].min(1), UNSEEN)
+        target = turn[self.faces].mean(1)
+        weight = areas * np.maximum(node_weight[self.faces].min(1), UNSEEN)
         # normal equations Σ_a G_aᵀ W G_a d = −Σ_a G_aᵀ W t_a, with a small multiple of the identity
         system = sum(slope.T @ diags_array(weight) @ slope for slope in slopes)
         system = system + LEVEL * areas.mean() * eye_array(self.nodes)
-        right = -sum(slope.T @ (weight * wanted[:, a]) for a, slope in enumerate(slopes))
+        right = -sum(slope.T @ (weight * target[:, a]) for a, slope in enumerate(slopes))
         return spsolve(system.tocsc(), right)
 
-    def moved(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
+    def displace(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
         """Move the vertices along their nodes' normals, by a displacement in extents, and update the normals."""
         weighted = area_vectors(self.mesh.vertices, self.mesh.faces)
         sums = [np.bincount(self.faces.reshape(-1), np.repeat(weighted[:, a], 3), self.nodes) for a in range(3)]
@@ -158,7 +161,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         outward = np.stack(sums, axis=1)
         outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
         place = self.mesh.vertices + (displacement[:, None] * self.extent * outward)[self.node]
-        normal = self.mesh.normals + self.turn_of(displacement)[self.node]
+        normal = self.mesh.normals + self.normal_change(displacement)[self.node]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         return msgspec.structs.replace(self.mesh, vertices=place, normals=normal)
 
@@ -167,5 +170,5 @@ def subdivided_mesh(mesh: Mesh) -> SubdividedMesh:
     """Subdivide a mesh until no edge is longer than `LONGEST` times its extent, and number its nodes."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     dense = subdivide(mesh, LONGEST * extent)
-    node = welded(dense.vertices)
+    node = weld_vertices(dense.vertices)
     return SubdividedMesh(dense, node, node[dense.faces], extent)

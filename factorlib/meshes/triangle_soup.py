@@ -50,12 +50,12 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             InputError: If there are too many triangles, or more vertices than the most triangles can use.
         """
         most_vertices = VERTICES_A_TRIANGLE * self.triangles
-        for count, most, what in ((triangles, self.triangles, "triangles"), (vertices, most_vertices, "vertices")):
+        for count, most, element in ((triangles, self.triangles, "triangles"), (vertices, most_vertices, "vertices")):
             if count > most:
                 raise InputError(
-                    f"has {count:,} {what}",
+                    f"has {count:,} {element}",
                     file=file,
-                    cure=f'simplify it; at most {most:,} {what} are read (SET="align.limits.triangles=…")',
+                    cure=f'simplify it; at most {most:,} {element} are read (SET="align.limits.triangles=…")',
                 )
 
     @staticmethod
@@ -142,7 +142,7 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
     return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1).astype(np.int64)
 
 
-def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
+def check_soup(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     """Check that triangles read from a file make a usable shape, and return them.
 
     Raises:

@@ -147,13 +147,13 @@ def on_floor(
     floor = disk(foot - HAIR * extent * plane.normal, plane.normal, REACH * extent, grey)
     # L₀, L₁ and W
     without = traced_photo(scene, samples, world_from_camera, with_light)
-    with_ = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
-    alone = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
+    with_floor = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
+    coverage = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
     # f, from the distance between the foot of the objects and the floor point of each pixel
     eye = world_from_camera[:3, 3]
     rays = (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)
     points = Plane(plane.normal, plane.point - eye).hit(rays) + eye
-    distance = np.linalg.norm(points - foot, axis=-1).reshape(alone.shape) / (REACH * extent)
+    distance = np.linalg.norm(points - foot, axis=-1).reshape(coverage.shape) / (REACH * extent)
     fade = smooth_step((1 - np.nan_to_num(distance, nan=np.inf)) / (1 - SOLID))
-    weight = np.maximum(alone, fade)[..., None]
-    return weight * with_ + (1 - weight) * without
+    weight = np.maximum(coverage, fade)[..., None]
+    return weight * with_floor + (1 - weight) * without

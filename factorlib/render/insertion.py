@@ -42,7 +42,7 @@ from factorlib.render.ground import Plane, disk, height_over, smooth_step
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
 from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3
-from factorlib.tracing.scene import Channels, denoised, rendered, rgb, rigid, sensor, shape
+from factorlib.tracing.scene import Channels, denoise_picture, render_scene, rgb, rigid, sensor, shape
 
 FADE = 0.5  # outer share of the disc's radius in which shadows fade
 FIT_SAMPLES = 16
@@ -118,7 +118,7 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
     @property
     def sensor(self) -> dict[str, Any]:
         """The photo's camera, for Mitsuba."""
-        return sensor(self.scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=self.scene.near)
+        return sensor(self.scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near_clip=self.scene.near_clip)
 
     def disc(self, material: Reflectance) -> dict[str, Any]:
         """Return the ground about the spot as a Mitsuba disk."""
@@ -145,7 +145,9 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
         """
         photo_light, objects = self.entries
         channels = Channels(hide_emitters=True, guides=guides)
-        return rendered((light or photo_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels)
+        return render_scene(
+            (light or photo_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels
+        )
 
 
 class ShadowMatch(msgspec.Struct, frozen=True):
@@ -194,7 +196,7 @@ class InsertionResult(msgspec.Struct, frozen=True):
     without: Picture
 
 
-def inserted(
+def insert_object(
     insertion: InsertionScene,
     photo: Picture,
     covered: Bool[np.ndarray, "h w"],
@@ -223,20 +225,21 @@ def inserted(
     report(2)
     # weight that falls smoothly from 1 near the spot, and above the horizon, to 0 at the rim of the disc
     fade = smooth_step((1 - np.where(np.isinf(insertion.distance), 0, insertion.distance)) / (1 - FADE))[..., None]
-    beside = (1 - coverage)[..., None]
+    background = (1 - coverage)[..., None]
     disc = insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))
     rendering = partial(insertion.radiance, samples=samples, seed=seed)
-    without, with_, shadow = _lighting(
+    without, with_object, shadow = _lighting(
         [rendering(e, guides=insertion.scene.denoise) for e in (disc, disc | new)], coverage, fade
     )
     report(3)
     # (2)
-    composite = beside * shadow * photo + np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
+    gain = np.maximum(with_object - background * shadow * without, 0) * (background < 1)
+    composite = background * shadow * photo + gain
     # change of the ground's specular part: the object's reflection in it
     if insertion.ground.polish is not None:
         polished = insertion.disc(insertion.ground.polish)
         mirrored = rendering(polished | new) - rendering(polished)
-        composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * fade, 0)
+        composite = np.maximum(composite + mirrored * shows_ground[..., None] * background * fade, 0)
     report(STEPS)
     return InsertionResult(composite, coverage, shadow, np.asarray(diffuse), without)
 
@@ -256,24 +259,24 @@ def _lighting(
         coverage: α
         fade: weight of the shadow
     """
-    (without, guides_without), (with_, guides_with) = (np.split(each, [3], axis=-1) for each in renderings)
+    (without, guides_without), (with_object, guides_with) = (np.split(each, [3], axis=-1) for each in renderings)
     with np.errstate(divide="ignore", invalid="ignore"):
-        shadow = np.where(without > 0, with_ / without, 1.0)
-    beside = coverage == 0
-    if beside.any():
-        row, column = distance_transform_edt(~beside, return_distances=False, return_indices=True)
+        shadow = np.where(without > 0, with_object / without, 1.0)
+    uncovered = coverage == 0
+    if uncovered.any():
+        row, column = distance_transform_edt(~uncovered, return_distances=False, return_indices=True)
         shadow = shadow[row, column]
     shadow = 1 + (shadow - 1) * fade
     if guides_with.size:  # not the photo, nor pixels whose paths miss the object
-        clean, with_ = (
-            denoised(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
-            for noisy, guides in ((shadow, guides_without), (with_, guides_with))
+        clean, with_object = (
+            denoise_picture(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
+            for noisy, guides in ((shadow, guides_without), (with_object, guides_with))
         )
         shadow = np.where(shadow == 1, 1, clean)
-    return without, with_, shadow
+    return without, with_object, shadow
 
 
-def compared_shadow(
+def compare_shadow(
     insertion: InsertionScene, result: InsertionResult, photo: Picture, covered: Bool[np.ndarray, "h w"], samples: int
 ) -> ShadowMatch:
     """Compare the photo's own shadow with L₀, on the ground near its objects.
@@ -322,11 +325,11 @@ def _coverage(insertion: InsertionScene, samples: int) -> Float[np.ndarray, "h w
         part = submesh(new.mesh, label)
         sides = [part]
         if new.mesh.open:
-            behind = part.vertices - HAIR * new.mesh.radius * part.normals
-            sides.append(Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True))
+            inner = part.vertices - HAIR * new.mesh.radius * part.normals
+            sides.append(Mesh(inner, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True))
         for number, side in enumerate(sides):
             entries[f"{new.name}_{label}_{number}"] = shape(side, surface, new.world_from_object, emitter)
-    coverage = np.clip(rendered(entries, insertion.sensor, samples, 1, 1)[..., 0], 0, 1)
+    coverage = np.clip(render_scene(entries, insertion.sensor, samples, 1, 1)[..., 0], 0, 1)
     if not coverage.any():
         raise InputError(
             "the new object is invisible: it stands outside the picture, or other objects hide it",
@@ -350,5 +353,5 @@ def shadow_match(photo: Picture, lit: Picture, constant: Picture, mask: Bool[np.
     logs = [np.log(luminance[mask]) for luminance in luminances]
     if mask.sum() < FEWEST or min(map(np.ptp, logs)) == 0:
         return ShadowMatch(None, None, int(mask.sum()))
-    recovered, shape = (float(np.corrcoef(logs[0], other)[0, 1]) for other in logs[1:])
+    recovered, shape = (float(np.corrcoef(logs[0], row)[0, 1]) for row in logs[1:])
     return ShadowMatch(recovered, shape, int(mask.sum()))

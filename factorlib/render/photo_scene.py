@@ -22,7 +22,7 @@ from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.images.exr import write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.light.latlong import rotate_map
-from factorlib.light.lobes import Lobes, lobe_integral
+from factorlib.light.lobes import Lobes, lobe_energy
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
@@ -30,12 +30,12 @@ from factorlib.tracing.scene import (
     NARROWEST,
     Channels,
     bsdf,
-    denoised,
+    denoise_picture,
     envmap,
     envmap_of_nodes,
     mitsuba_map,
     paint,
-    rendered,
+    render_scene,
     rgb,
     rigid,
     sensor,
@@ -97,7 +97,7 @@ class PhotoScene(msgspec.Struct, frozen=True):
         return float(np.linalg.norm(self.middle))
 
     @property
-    def near(self) -> float:
+    def near_clip(self) -> float:
         """The near clipping distance of the camera."""
         return NEAR * self.size
 
@@ -114,11 +114,11 @@ def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, sh
         share: the sun's share of the energy, in [0, 1]
     """
     # `factor` scales the rest of the light; the sun takes the energy that is left
-    rest = light.take(~light.suns)
-    factor = np.divide((1 - share) * light.energy, rest.energy, out=np.zeros(3), where=rest.energy > 0)
-    sharpness = np.append(rest.sharpness, 4 / np.radians(diameter_deg / 2) ** 2)
-    weight = (light.energy - factor * rest.energy) / lobe_integral(sharpness[-1])
-    return Lobes(np.vstack([rest.axis, axis]), sharpness, np.vstack([factor * rest.weight, weight]))
+    sky = light.take(~light.suns)
+    factor = np.divide((1 - share) * light.energy, sky.energy, out=np.zeros(3), where=sky.energy > 0)
+    sharpness = np.append(sky.sharpness, 4 / np.radians(diameter_deg / 2) ** 2)
+    weight = (light.energy - factor * sky.energy) / lobe_energy(sharpness[-1])
+    return Lobes(np.vstack([sky.axis, axis]), sharpness, np.vstack([factor * sky.weight, weight]))
 
 
 def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
     entries = {"light": envmap_of_nodes(mitsuba_map(light.take(~narrow), LOBE_ROWS, 2 * LOBE_ROWS))}
     few = light.take(narrow)
     far = FAR * size
-    energies = few.weight * lobe_integral(few.sharpness)[:, None]
+    energies = few.weight * lobe_energy(few.sharpness)[:, None]
     radii = 2 / np.sqrt(few.sharpness)  # angular radius of a disc of the lobe's RMS width
     for k, (axis, radius, energy) in enumerate(zip(few.axis @ YUP_FROM_CAMERA, radii, energies, strict=True)):
         emitter = {"type": "area", "radiance": rgb(energy / (2 * np.pi * (1 - np.cos(radius))))}
@@ -161,7 +161,7 @@ def traced_photo(
     samples: int,
     world_from_camera: Float[np.ndarray, "4 4"] | None = None,
     with_light: bool = False,
-    beside: Mapping[str, Any] = {},
+    extra_entries: Mapping[str, Any] = {},
     max_depth: int | None = None,
 ) -> Float[np.ndarray, "h w 4"]:
     """Render the scene by path tracing.
@@ -171,21 +171,21 @@ def traced_photo(
         samples: samples per pixel
         world_from_camera: pose of the camera, in OpenCV's axes; by default the photo's own
         with_light: show the light behind the objects
-        beside: further entries of the scene, for Mitsuba
+        extra_entries: further entries of the scene, for Mitsuba
         max_depth: replaces the scene's own
 
     Returns:
         Linear radiance times coverage, and coverage: the share of a pixel that objects, or the visible light, fill.
     """
     pose = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
-    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **beside}
-    view = sensor(scene.camera, pose, near=scene.near, alpha=True)
+    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **extra_entries}
+    view = sensor(scene.camera, pose, near_clip=scene.near_clip, alpha=True)
     depth = scene.max_depth if max_depth is None else max_depth
     channels = Channels(hide_emitters=not with_light, guides=scene.denoise)
-    picture = rendered(entries, view, samples, 0, depth, channels)
+    picture = render_scene(entries, view, samples, 0, depth, channels)
     if with_light:
         picture[..., 3] = 1
-    return denoised(picture) if scene.denoise else picture
+    return denoise_picture(picture) if scene.denoise else picture
 
 
 def lit_ball(
@@ -210,11 +210,11 @@ def lit_ball(
     sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
     view = sensor(camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), alpha=True)
     entries = {**light_entries(light, distance), "ball": sphere}
-    picture = rendered(entries, view, samples, 0, DIRECT, Channels(hide_emitters=True, guides=denoise))
-    return denoised(picture) if denoise else picture
+    picture = render_scene(entries, view, samples, 0, DIRECT, Channels(hide_emitters=True, guides=denoise))
+    return denoise_picture(picture) if denoise else picture
 
 
-def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
+def resize_scene(scene: PhotoScene, width: int | None) -> PhotoScene:
     """Return the scene with a camera of another width in pixels and the same field of view."""
     if width is None:
         return scene
@@ -247,13 +247,13 @@ class Orbit(msgspec.Struct, frozen=True):
         return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / self.zoom)
 
 
-def turned_light(light: DistantLight, angle_deg: float) -> DistantLight:
+def rotate_light(light: DistantLight, angle_deg: float) -> DistantLight:
     """Return the light turned about the upright axis of the world."""
     if angle_deg == 0:
         return light  # resampling would blur a map
     turn = rotation_of_vector(np.radians(angle_deg) * UP)
     if isinstance(light, Lobes):
-        return light.turned(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)
+        return light.rotate(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)
     return rotate_map(light, turn, finer=2)
 
 
@@ -261,7 +261,7 @@ Radiance = Float[np.ndarray, "h w 3"]
 Tone = Callable[[Radiance], Radiance]
 
 
-def as_it_is(radiance: Radiance) -> Radiance:
+def identity_tone(radiance: Radiance) -> Radiance:
     """Return the radiance unchanged: the tone curve of a photo that has none."""
     return radiance
 
@@ -275,7 +275,7 @@ class TracedPicture(msgspec.Struct, frozen=True):
     """
 
     pixels: Float[np.ndarray, "h w 4"]
-    tone: Tone = as_it_is
+    tone: Tone = identity_tone
 
     @property
     def coverage(self) -> Float[np.ndarray, "h w 1"]:
@@ -283,7 +283,7 @@ class TracedPicture(msgspec.Struct, frozen=True):
         return np.clip(self.pixels[..., 3:], 0, 1)
 
     @property
-    def toned(self) -> Radiance:
+    def display_radiance(self) -> Radiance:
         """The radiance after the tone curve, with coverage divided out."""
         share = self.pixels[..., 3:]
         return self.tone(self.pixels[..., :3] / np.where(share > 0, share, 1))
@@ -291,19 +291,21 @@ class TracedPicture(msgspec.Struct, frozen=True):
     @property
     def exposure(self) -> float:
         """The display exposure for the covered pixels."""
-        return exposure_of(self.toned, self.pixels[..., 3] > 0.5)
+        return exposure_of(self.display_radiance, self.pixels[..., 3] > 0.5)
 
-    def exposed(self) -> TracedPicture:
+    def with_exposure(self) -> TracedPicture:
         """Return the picture times its own exposure, without a tone curve."""
         return TracedPicture(self.pixels * np.array([self.exposure] * 3 + [1.0]))
 
-    def over(self, photo: Radiance) -> Radiance:
+    def composite_over(self, photo: Radiance) -> Radiance:
         """Composite the picture, after its tone curve, over a photo."""
-        return (1 - self.coverage) * photo + self.coverage * self.toned
+        return (1 - self.coverage) * photo + self.coverage * self.display_radiance
 
     def rgba(self, exposure: float = 1.0) -> UInt8[np.ndarray, "h w 4"]:
         """Return 8-bit sRGB with coverage as alpha."""
-        return np.concatenate([picture(self.toned, exposure), np.rint(255 * self.coverage).astype(np.uint8)], axis=-1)
+        return np.concatenate(
+            [picture(self.display_radiance, exposure), np.rint(255 * self.coverage).astype(np.uint8)], axis=-1
+        )
 
     def to_exr(self, path: str | Path) -> None:
         """Write linear radiance times coverage, and coverage as channel A."""

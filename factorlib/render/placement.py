@@ -68,13 +68,13 @@ def spot_beside(
         x, y = scene.camera.project(point @ YUP_FROM_CAMERA)
         width = scene.camera.width
         middles = [each.vertices.mean(axis=0) @ YUP_FROM_CAMERA for each in others]
-        taken = [abs(scene.camera.project(middle)[0] - x) for middle in middles]
-        return min([x, width - x, scene.camera.height - y, *taken])
+        distances = [abs(scene.camera.project(middle)[0] - x) for middle in middles]
+        return min([x, width - x, scene.camera.height - y, *distances])
 
     return Spot(plane, max(spots, key=room), height)
 
 
-def spot_at(
+def unproject_spot(
     scene: PhotoScene, plane: Plane, neighbour: PlacedMesh, pixel: tuple[float, float], relative_height: float
 ) -> Spot:
     """Return the place on the ground that a pixel shows.
@@ -226,7 +226,7 @@ class FreeSpace:
 
 
 def free_placement(
-    scene: PhotoScene, stand: Callable[[Spot], PlacedMesh], spot: Spot, asked: bool, factor: int = 1
+    scene: PhotoScene, stand: Callable[[Spot], PlacedMesh], spot: Spot, is_requested: bool, factor: int = 1
 ) -> tuple[PlacedMesh, Spot, str]:
     """Place a new object where it intersects none of the photo's objects and is visible.
 
@@ -234,7 +234,7 @@ def free_placement(
         scene: the photo's scene
         stand: places the object on a spot
         spot: the requested spot
-        asked: True if the recipe names the spot
+        is_requested: True if the recipe names the spot
         factor: pixels of the photo per pixel of the scene's camera
 
     Returns:
@@ -260,11 +260,10 @@ def free_placement(
             if (move := smaller.nearest_move()) is not None:
                 cure = f"make it smaller: at {share} of its size it fits at {smaller.pixel_text(move, factor)}"
                 break
-        raise InputError(
-            f"the new object has no free place in the picture: {reason}", key="at" if asked else "size", cure=cure
-        )
+        fault = f"the new object has no free place in the picture: {reason}"
+        raise InputError(fault, key="at" if is_requested else "size", cure=cure)
     place = space.pixel_text(move, factor)
-    if asked and not intersected:
+    if is_requested and not intersected:
         raise InputError(f"the new object is invisible: {reason}", key="at", cure=f"the nearest free place is {place}")
     free = msgspec.structs.replace(spot, point=spot.point + move)
     heights = np.linalg.norm(move) / spot.height

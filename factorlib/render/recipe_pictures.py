@@ -24,9 +24,17 @@ from factorlib.jsonfile import write_json
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import AnyRecipe, is_light_file
 from factorlib.render.ground import on_floor
-from factorlib.render.insertion import NEW, STEPS, InsertionScene, compared_shadow, inserted
-from factorlib.render.photo_scene import Orbit, PhotoScene, TracedPicture, lit_ball, resized, traced_photo, turned_light
-from factorlib.render.placement import free_placement, spot_at, spot_beside, standing_mesh
+from factorlib.render.insertion import NEW, STEPS, InsertionScene, compare_shadow, insert_object
+from factorlib.render.photo_scene import (
+    Orbit,
+    PhotoScene,
+    TracedPicture,
+    lit_ball,
+    resize_scene,
+    rotate_light,
+    traced_photo,
+)
+from factorlib.render.placement import free_placement, spot_beside, standing_mesh, unproject_spot
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
@@ -57,9 +65,9 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
         return write_grid(recipe, results, out, progress)
     photos = recipe.photos or results.photos
     refusals = []
-    for done, photo in enumerate(photos):
+    for index, photo in enumerate(photos):
         try:
-            report = partial(_report_photo, progress, done, len(photos), photo)
+            report = partial(_report_photo, progress, index, len(photos), photo)
             facts = WRITERS[type(recipe)](recipe, results, photo, out, report) or {}
             captions = [facts.pop("caption")] if facts else []
             if recipe.sun is not None:
@@ -116,7 +124,7 @@ def write_resynthesis(
             )
         scene = msgspec.structs.replace(scene, materials={**scene.materials, **replaced})
     traced = TracedPicture(traced_photo(scene, recipe.samples), results.tone(photo))
-    _write_opaque(out / photo, traced.over(results.photo(photo)))
+    _write_opaque(out / photo, traced.composite_over(results.photo(photo)))
 
 
 def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) -> InsertionScene:
@@ -153,7 +161,7 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
         )
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
-        requested = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
+        requested = unproject_spot(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
     else:
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
         slenderness = wide / np.ptp(mesh.vertices @ up)  # diameter about the upright axis over the extent along it
@@ -185,13 +193,13 @@ def write_insertion(
     insertion = insertion_scene(recipe, results, photo)
     if insertion.moved:
         log.warning("%s: %s", photo, insertion.moved)
-    linear = results.straightened(photo)
-    covered = results.covered(photo)
-    result = inserted(insertion, linear, covered, recipe.samples, lambda done: report(done / STEPS))
-    match = compared_shadow(insertion, result, linear, covered, recipe.samples)
+    linear = results.linear_photo(photo)
+    covered = results.photo_mask(photo)
+    result = insert_object(insertion, linear, covered, recipe.samples, lambda done: report(done / STEPS))
+    match = compare_shadow(insertion, result, linear, covered, recipe.samples)
     # Pixels that the new object does not change keep the photo's values exactly.
-    same = (result.coverage[..., None] == 0) & (result.shadow == 1) & (insertion.ground.polish is None)
-    _write_opaque(out / photo, np.where(same, results.photo(photo), results.tone(photo)(result.composite)))
+    unchanged = (result.coverage[..., None] == 0) & (result.shadow == 1) & (insertion.ground.polish is None)
+    _write_opaque(out / photo, np.where(unchanged, results.photo(photo), results.tone(photo)(result.composite)))
     pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
     source = "that of dataset.yaml"
     if results.grounds[photo].ground is None:
@@ -205,7 +213,7 @@ def write_insertion(
     }
 
 
-def staged(
+def render_view(
     recipe: kinds.BackgroundRecipe,
     results: SolvedSet,
     photo: str,
@@ -247,8 +255,8 @@ def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Pa
         report: receives the share that is done, in [0, 1]
     """
     report(0)
-    scene = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
-    traced = staged(recipe, results, photo, scene, Orbit(recipe.azimuth, recipe.elevation, recipe.zoom))
+    scene = resize_scene(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
+    traced = render_view(recipe, results, photo, scene, Orbit(recipe.azimuth, recipe.elevation, recipe.zoom))
     _write_transparent(out / photo, TracedPicture(traced, results.tone(photo)))
 
 
@@ -266,15 +274,15 @@ def write_animation(
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    scene = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
+    scene = resize_scene(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
     pixels = []
     for k in range(recipe.frames):
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
         if isinstance(recipe, kinds.TurntableRecipe):
-            traced = staged(recipe, results, photo, scene, Orbit(degrees))
+            traced = render_view(recipe, results, photo, scene, Orbit(degrees))
         else:
-            turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
+            turned = msgspec.structs.replace(scene, light=rotate_light(scene.light, degrees))
             traced = traced_photo(turned, recipe.samples)
         pixels.append(TracedPicture(traced, results.tone(photo)).rgba())
     (out / photo).mkdir(parents=True)
@@ -296,14 +304,14 @@ def write_relit(recipe: kinds.RelightRecipe, results: SolvedSet, photo: str, out
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    scene = resized(results.scene(photo, denoise=recipe.denoise), recipe.width)
+    scene = resize_scene(results.scene(photo, denoise=recipe.denoise), recipe.width)
     lights = recipe.lights or [name for name in results.photos if name != photo]
     for k, name in enumerate(lights):
         report(k / len(lights))
-        lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
-        traced = staged(recipe, results, photo, lit)
+        lit = msgspec.structs.replace(scene, light=rotate_light(results.light(name), recipe.rotate))
+        traced = render_view(recipe, results, photo, lit)
         file = is_light_file(name)
-        relit = TracedPicture(traced).exposed() if file else TracedPicture(traced, results.tone(name))
+        relit = TracedPicture(traced).with_exposure() if file else TracedPicture(traced, results.tone(name))
         _write_transparent(out / photo / Path(name).stem, relit)
 
 
@@ -337,7 +345,7 @@ def write_grid(recipe: kinds.GridRecipe, results: SolvedSet, out: Path, progress
         for j, material in enumerate(materials):
             progress(k * len(materials) + j, total, f"{material}, {name}")
             balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples, recipe.denoise))
-        columns.append(TracedPicture(np.concatenate(balls)).exposed().pixels)
+        columns.append(TracedPicture(np.concatenate(balls)).with_exposure().pixels)
     _write_transparent(out / "grid", TracedPicture(np.concatenate(columns, axis=1)))
     denoised = f"denoised: {denoiser()}\n" if recipe.denoise else ""
     write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n{denoised}")

@@ -157,7 +157,7 @@ class Surroundings(msgspec.Struct, frozen=True):
     bounced: Float[np.ndarray, "n 6"] | None = None
 
 
-def resynthesised(
+def resynthesise(
     reflector: Reflector,
     materials: Sequence[Reflectance],
     photo: Channels,
@@ -234,7 +234,9 @@ def nearest_surroundings(
     return visibility, bounced, place
 
 
-def balls(reflector: Reflector, material: Reflectance, sizes: Sequence[int]) -> list[Float[np.ndarray, "size size 3"]]:
+def render_balls(
+    reflector: Reflector, material: Reflectance, sizes: Sequence[int]
+) -> list[Float[np.ndarray, "size size 3"]]:
     """Render a ball at several sizes, which share one evaluation.
 
     Args:

@@ -13,19 +13,19 @@ from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.tone import shown, straightened
+from factorlib.images.tone import apply_tone, invert_tone
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.mesh import Mesh, scaled
-from factorlib.meshes.read import CREASE_DEG, MeshCache, read_mesh
+from factorlib.meshes.mesh import Mesh, scale_mesh
+from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import GroundSurface
-from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, as_it_is, with_sun
-from factorlib.results.lobe_table import light_of
+from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, identity_tone, with_sun
+from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import read_surface
+from factorlib.results.surface_table import read_surface
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import rigid
 
@@ -113,10 +113,10 @@ class SolvedSet:
         channels = self._masks(photo)
         return np.nan_to_num(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float))
 
-    def straightened(self, photo: str) -> Float[np.ndarray, "h w 3"]:
+    def linear_photo(self, photo: str) -> Float[np.ndarray, "h w 3"]:
         """Return the photo's linear radiance with its tone curve undone."""
         tone = self.table.model.tone.get(photo)
-        return straightened(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
+        return invert_tone(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
 
     def pixel(self, photo: str, pixel: tuple[float, float]) -> tuple[float, float]:
         """Convert a pixel of the photo to pixels of the picture from `masks`; InputError if it lies outside."""
@@ -130,7 +130,7 @@ class SolvedSet:
             )
         return pixel[0] / factor, pixel[1] / factor
 
-    def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
+    def photo_mask(self, photo: str) -> Bool[np.ndarray, "h w"]:
         """Return a mask of the pixels that are not background."""
         channels = self._masks(photo)
         return (channels["label"] > 0) | (channels["left_out"] > 0)
@@ -138,13 +138,13 @@ class SolvedSet:
     def tone(self, photo: str) -> Tone:
         """Return the photo's tone curve."""
         tone = self.table.model.tone.get(photo)
-        return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else as_it_is
+        return (lambda radiance: apply_tone(radiance, tone.exponent, tone.pivot)) if tone else identity_tone
 
     def light(self, name: str) -> DistantLight:
         """Return a photo's light in its camera's axes, or the light of a file."""
         if is_light_file(name):
             return read_light_map(self.inputs.file(f"recipe file:{name}"))
-        return light_of(self.inputs["export"], name, self.lights[name])
+        return read_photo_light(self.inputs["export"], name, self.lights[name])
 
     def with_table(self, table: str | None) -> dict[str, Reflectance]:
         """Return the solved materials, replaced and extended by those of a table file."""
@@ -155,17 +155,17 @@ class SolvedSet:
 
     def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the ground given with the photo, or the plane that the neighbour rests on."""
-        given = self.grounds[photo].ground
-        if given is None:
+        ground_entry = self.grounds[photo].ground
+        if ground_entry is None:
             # up vectors of the cameras of all objects of the mesh, in its frame
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
             poses = [self.poses[each].objects[obj.name] for each, obj in self._objects_of(mesh)]
             trusted = [pose for pose in poses if not pose.left_out] or poses
             uprights = np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
             return GroundSurface(resting_plane(neighbour, uprights))
-        normal = YUP_FROM_CAMERA @ np.array(given.normal)
+        normal = YUP_FROM_CAMERA @ np.array(ground_entry.normal)
         return GroundSurface(
-            Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse
+            Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(ground_entry.point)), ground_entry.diffuse
         )
 
     def mesh(
@@ -243,7 +243,7 @@ class SolvedSet:
         pose = poses.objects[obj.name]
         mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
-        return PlacedMesh(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
+        return PlacedMesh(obj.name, scale_mesh(mesh, pose.scale), tuple(self.names), place)
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:

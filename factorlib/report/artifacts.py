@@ -13,11 +13,11 @@ from jaxtyping import Float
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.reading import check_plain
 from factorlib.results.materials import Channels as Factors
-from factorlib.results.materials import MaterialTable, Solved, read_exposures, read_materials
+from factorlib.results.materials import MaterialTable, SolvedMaterial, read_exposures, read_materials
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import SurfaceTable, read_surface
+from factorlib.results.surface_table import SurfaceTable, read_surface
 
 STAGES = ["masks", "align", "urm", "surface", "train", "solve", "export", "render", "evaluate"]
 
@@ -90,7 +90,7 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         return self.read(read_materials, "solve", "materials.json") or MaterialTable({})
 
     @cached_property
-    def exported(self) -> dict[str, Solved]:
+    def exported(self) -> dict[str, SolvedMaterial]:
         """The materials in the gauge of the exported lights."""
         return (self.read(read_materials, "export", "materials.json") or MaterialTable({})).materials
 

@@ -12,9 +12,9 @@ from factorlib.errors import InputError
 from factorlib.images.picture import exposure_of, picture
 from factorlib.pack import check_whole
 from factorlib.report.artifacts import STAGES, Artifacts, Picture
-from factorlib.report.pictures import data_uri, reduced
-from factorlib.report.template import DASH, headlines, number, percent, rendered
-from factorlib.results.materials import MaterialTable, Solved, read_materials
+from factorlib.report.pictures import data_uri, downsample
+from factorlib.report.template import DASH, headlines, number, percent, render_template
+from factorlib.results.materials import MaterialTable, SolvedMaterial, read_materials
 from factorlib.results.photos import read_photos
 
 # results that both runs must have
@@ -51,7 +51,7 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
         """Return both runs' pictures of a kind, by name."""
         return [_pair(name, *(run.rgb(stage, f"{kind}/{name}") for run in runs)) for name in names]
 
-    return rendered(
+    return render_template(
         "comparison.html",
         names=[str(first), str(second)],
         changes=changes,
@@ -96,7 +96,9 @@ def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]
     return [_row(name, part, first[name], second[name], factor[name]) for name in names for part in parts]
 
 
-def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.ndarray, "3"]) -> dict[str, Any]:
+def _row(
+    name: str, part: str, first: SolvedMaterial, second: SolvedMaterial, factor: Float[np.ndarray, "3"]
+) -> dict[str, Any]:
     """Return both values per channel in words, and `off`, their difference in standard errors.
 
     `off` is None if neither value has a standard error.
@@ -115,7 +117,7 @@ def _pair(name: str, first: Picture | None, second: Picture | None) -> dict[str,
     """Return two pictures of one thing at one exposure, with their difference in words; either may be missing."""
     present = [each for each in (first, second) if each is not None]
     exposure = exposure_of(present[0]) if present else 1.0
-    uris = [None if each is None else data_uri(picture(reduced(each, WIDTH), exposure)) for each in (first, second)]
+    uris = [None if each is None else data_uri(picture(downsample(each, WIDTH), exposure)) for each in (first, second)]
     if first is None or second is None:
         apart = ""
     elif first.shape != second.shape:

@@ -15,7 +15,7 @@ from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
-from factorlib.report.template import headlines, rendered, sentences
+from factorlib.report.template import headlines, render_template, sentences
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
 from factorlib.results.poses import AS_IT_IS
@@ -62,7 +62,7 @@ def page(
     assert metrics is not None
     exposure = pictures.exposures(run)
     cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in run.set.photos] for m in run.set.materials]
-    return rendered(
+    return render_template(
         "index.html",
         set=run.set,
         metrics=metrics,
@@ -79,7 +79,7 @@ def page(
         surface=run.surface,
         surfaces=surfaces,
         training=_training(run),
-        cost=cost_of(run.events(), STAGES),
+        cost=stage_costs(run.events(), STAGES),
         viewed=viewed,
         **_facts(run, metrics),
     )
@@ -149,10 +149,10 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
     return {
         "numbers": json.dumps({name: numbers}),
         "Mitsuba": material_xml(name, material),
-        "Blender": rendered("blender.txt", name=repr(name), material=material) + "\n",
+        "Blender": render_template("blender.txt", name=repr(name), material=material) + "\n",
         "MaterialX": materialx({name: material}),
         "glTF": json.dumps({"name": name, **gltf}),
-        "three.js": rendered("three.txt", plain=plain, specular=specular),
+        "three.js": render_template("three.txt", plain=plain, specular=specular),
     }
 
 
@@ -176,8 +176,8 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
     pixels = run.read(read_png, "align", f"{photo}_overlay.png")
     if pixels is None:
         return None
-    crop = pixels[pictures.box_of(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
-    return pictures.data_uri(pictures.reduced(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
+    crop = pixels[pictures.mask_box(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
+    return pictures.data_uri(pictures.downsample(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
 
 
 # ── Training ─────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -209,7 +209,7 @@ def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Ma
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def cost_of(events: list[dict], order: list[str]) -> dict[str, list]:
+def stage_costs(events: list[dict], order: list[str]) -> dict[str, list]:
     """Return the cost of each stage in the last run of each step: the only part of the page that differs between runs.
 
     An event is {"event": "done", "stage", "photo", "seconds", "cpu_seconds", "memory_mb", "machine", …} for a step, or

@@ -18,7 +18,7 @@ from factorlib.evaluate.picture_errors import agreeing_pixels
 from factorlib.images.exr import read_exr
 from factorlib.images.picture import exposure_of, nearest_tags, picture, png_bytes
 from factorlib.images.tone import srgb_encode
-from factorlib.render.photo_scene import TracedPicture, traced_photo, turned_light
+from factorlib.render.photo_scene import TracedPicture, rotate_light, traced_photo
 from factorlib.render.solved_set import SolvedSet
 from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.lobe_table import read_lobes
@@ -45,14 +45,14 @@ def data_uri(pixels: Pixels) -> str:
     return "data:image/png;base64," + base64.b64encode(png_bytes(pixels)).decode("ascii")
 
 
-def reduced(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray, "H W c"]:
+def downsample(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray, "H W c"]:
     """Downsample by area averages until no side is longer than `longest` pixels; a small picture is unchanged."""
     height, width = picture.shape[:2]
     scale = min(1.0, longest / max(height, width))
     if scale == 1.0:
         return picture
 
-    def averaged(rows: Float[np.ndarray, "n m c"]) -> Float[np.ndarray, "N m c"]:
+    def average(rows: Float[np.ndarray, "n m c"]) -> Float[np.ndarray, "N m c"]:
         """Downsample rows: means weighted by the overlap of source and target rows."""
         target = max(1, round(len(rows) * scale))
         edges = np.arange(target + 1) * (len(rows) / target)
@@ -61,10 +61,10 @@ def reduced(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarr
         means = csr_array(np.maximum(overlap, 0) * (target / len(rows))) @ rows.reshape(len(rows), -1)
         return means.reshape(target, *rows.shape[1:]).astype(np.float32)
 
-    return averaged(averaged(picture).swapaxes(0, 1)).swapaxes(0, 1)
+    return average(average(picture).swapaxes(0, 1)).swapaxes(0, 1)
 
 
-def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:
+def mask_box(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:
     """Return rows and columns of the mask's bounding box; the whole picture for an empty mask.
 
     `margin` is the margin as a fraction of the box's longer side.
@@ -82,7 +82,7 @@ def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return mask & ~binary_erosion(mask, border_value=1)
 
 
-def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndarray, "n n 4"]:
+def ball_rgba(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndarray, "n n 4"]:
     """Return the display values of a ball that fills the picture, transparent around it."""
     height, width = radiance.shape[:2]
     y, x = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (height, width))
@@ -138,24 +138,24 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
     """
     masks = run.channels("masks", name)
     geometry = run.channels("align", name)
-    again = run.rgb("render", f"resynthesis/{name}")
+    resynthesis = run.rgb("render", f"resynthesis/{name}")
     exposure = errors.exposure if errors else 1.0
-    box = box_of(np.rint(masks["label"]) > 0)
+    box = mask_box(np.rint(masks["label"]) > 0)
     masks, geometry = ({k: v[box] for k, v in channels.items()} for channels in (masks, geometry))
     photo = np.nan_to_num(np.stack([masks[c] for c in "RGB"], axis=-1), posinf=0, neginf=0)
     display = picture(photo, exposure).astype(np.float32) / 255
     in_mask = masks["label"] > 0.5
     panels = {"photo": display, "materials": _labels(masks, geometry, photo * exposure, list(tags.values()))}
-    if again is not None:
-        again = picture(np.nan_to_num(again[box], posinf=0, neginf=0), exposure).astype(np.float32) / 255
+    if resynthesis is not None:
+        resynthesis = picture(np.nan_to_num(resynthesis[box], posinf=0, neginf=0), exposure).astype(np.float32) / 255
         explained = in_mask & (np.rint(masks["label"]) == np.rint(geometry["label"]))
-        panels["re-synthesis"] = np.concatenate([again, explained[..., None]], axis=-1)
-        difference = 0.5 + AMPLIFICATION * (again - display)  # grey where equal
+        panels["re-synthesis"] = np.concatenate([resynthesis, explained[..., None]], axis=-1)
+        difference = 0.5 + AMPLIFICATION * (resynthesis - display)  # grey where equal
         clipped = np.any([masks[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
         difference[~agreeing_pixels(masks, geometry) | clipped] = UNCOUNTED
         panels["difference"] = np.concatenate([np.clip(difference, 0, 1), in_mask[..., None]], axis=-1)
     longest = longest_side(len(run.set.photos))
-    pixels = {k: np.rint(255 * np.clip(reduced(v, longest), 0, 1)).astype(np.uint8) for k, v in panels.items()}
+    pixels = {k: np.rint(255 * np.clip(downsample(v, longest), 0, 1)).astype(np.uint8) for k, v in panels.items()}
     return PhotoRow(name, run.illumination_of(name), pixels, {k: data_uri(v) for k, v in pixels.items()}, errors)
 
 
@@ -180,23 +180,23 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
         return [photo]
     # camera cropped to the objects, and enlarged to the panel's size
     scene = results.scene(row.name)
-    box = box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
+    box = mask_box(np.rint(run.channels("masks", row.name)["label"]) > 0)
     top, left = (span.start for span in box)
     height, width = (span.stop - span.start for span in box)
     pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
     camera = scene.camera.window(left, top, pixel, ceil(width / pixel), ceil(height / pixel))
     scene = msgspec.structs.replace(scene, camera=camera)
-    again = TracedPicture(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
+    rerendered = TracedPicture(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
     others = [p for p in run.set.photos if run.illumination_of(p) in lit - {row.illumination}]
-    other = others[0] if others else None
-    light = results.light(other) if other else turned_light(scene.light, 180.0)
+    other_light = others[0] if others else None
+    light = results.light(other_light) if other_light else rotate_light(scene.light, 180.0)
     relit = TracedPicture(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
     exposure = row.errors.exposure if row.errors else 1.0
-    caption = f"in the light of {other}" if other else "in its own light, turned half around"
+    caption = f"in the light of {other_light}" if other_light else "in its own light, turned half around"
     return [
         photo,
-        ("re-synthesis", data_uri(again.rgba(exposure)), "path-traced from what was recovered"),
-        ("relit", data_uri(relit.exposed().rgba()), caption),
+        ("re-synthesis", data_uri(rerendered.rgba(exposure)), "path-traced from what was recovered"),
+        ("relit", data_uri(relit.with_exposure().rgba()), caption),
     ]
 
 
@@ -233,11 +233,11 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[di
         if mesh in table.log_factors:
             panels["detail of reflectance"] = srgb_encode(np.clip(0.4 * maps["by shading"]["detail"], 0, 1))
         uris = {}
-        box = box_of(masks[photo])
+        box = mask_box(masks[photo])
         longest = longest_side(len(run.set.photos))
         for title, panel in panels.items():
             colour = panel if panel.ndim == 3 else panel[..., None].repeat(3, 2)
-            small = reduced(np.where(masks[photo][..., None], colour, 1.0)[box].astype(np.float32), longest)
+            small = downsample(np.where(masks[photo][..., None], colour, 1.0)[box].astype(np.float32), longest)
             uris[title] = data_uri(np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
         # RMS and largest displacement, relative to the extent
         size = np.abs(table.displacements.get(mesh, [0.0]))
@@ -270,7 +270,7 @@ def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> dic
     """
     observed = photo in run.photo_facts and run.photo_facts[photo].pixels.get(material, 0) > 0
     radiance = run.rgb("render", f"materials/{photo}/{material}")
-    uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
+    uri = None if radiance is None else data_uri(ball_rgba(downsample(radiance, 96), exposure))
     return {"material": material, "photo": photo, "observed": observed, "uri": uri}
 
 
@@ -289,14 +289,14 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[dict[s
         channels = run.read(read_exr, "render", f"reflectance_maps/{photo}/{name}.exr")
         samples = observations and observations.take(observations.material == index)
         measured = data_uri(measured_map(samples, exposure)) if samples else None
-        uri = None if channels is None else data_uri(_ringed(channels, exposure))
+        uri = None if channels is None else data_uri(_outline_observed(channels, exposure))
         cells.append({"material": name, "uri": uri, "measured": measured})
     return cells
 
 
-def _ringed(channels: Channels, exposure: float) -> Pixels:
+def _outline_observed(channels: Channels, exposure: float) -> Pixels:
     """Return the solved map with an outline of the observed normals, white on dark and black on bright."""
-    pixels = disc(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
+    pixels = ball_rgba(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
     observed = channels.get("observed", np.zeros(pixels.shape[:2])) > 0.5
     if observed.mean() > LEAST_OBSERVED:
         line = outline(observed | ~(pixels[..., 3] > 0))
@@ -356,7 +356,7 @@ def light_row(
     known = run.rgb("export", f"coverage/{name}")
     row = {
         "name": name, "photos": photos, "errors": errors, "white": 1 / exposure, "peak": float(brightest.max()),
-        "uri": _outlined(radiance, exposure),
+        "uri": _outline_bright(radiance, exposure),
         "dark_uri": data_uri(picture(radiance, exposure / 16)),
         "overflow": float((over * area).sum() / (4 * np.pi)),
         "energy": float((energy * over).sum() / max(energy.sum(), 1e-30)),
@@ -372,7 +372,7 @@ def light_row(
     return row
 
 
-def _outlined(radiance: Picture, exposure: float) -> str:
+def _outline_bright(radiance: Picture, exposure: float) -> str:
     """Return a light with the texels above white outlined."""
     pixels = picture(radiance, exposure)
     pixels[outline((radiance * exposure).max(axis=-1) > 1)] = MAGENTA
@@ -384,7 +384,7 @@ def _true_map(true: Picture, estimate: Picture, exposure: float) -> str:
     means = [
         float((m * (lat_long_solid_angles(*m.shape[:2])[:, None, None] / m.shape[1])).sum()) for m in (true, estimate)
     ]
-    return _outlined(reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30)), exposure)
+    return _outline_bright(downsample(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30)), exposure)
 
 
 def _spheres(run: Artifacts, name: str) -> str | None:
@@ -395,5 +395,5 @@ def _spheres(run: Artifacts, name: str) -> str | None:
     exposure = exposure_of(truth, truth.max(-1) > 0, 97.0)
     rows = [truth, estimate * (truth.mean() / max(float(estimate.mean()), 1e-30))]
     balls = [[np.repeat(np.repeat(ball, 2, 0), 2, 1) for ball in np.split(row, 3, axis=1)] for row in rows]
-    discs = [[np.pad(disc(ball, exposure), ((4, 4), (0, 8), (0, 0))) for ball in row] for row in balls]
+    discs = [[np.pad(ball_rgba(ball, exposure), ((4, 4), (0, 8), (0, 0))) for ball in row] for row in balls]
     return data_uri(np.concatenate([np.concatenate(row, axis=1) for row in discs]))

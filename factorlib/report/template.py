@@ -16,7 +16,7 @@ MINUS = "\u2212"
 DASH = "\u2013"
 
 
-def rendered(template: str, **context: Any) -> str:
+def render_template(template: str, **context: Any) -> str:
     """Render a template; values are escaped, except in templates that end in .txt."""
     folder = files("factorlib.report") / "templates"
     environment = jinja2.Environment(
@@ -38,7 +38,7 @@ def rendered(template: str, **context: Any) -> str:
 
 def sentences(template: str, **context: Any) -> list[str]:
     """Render a template of sentences and return its lines that are not empty."""
-    return list(filter(None, rendered(template, **context).split("\n")))
+    return list(filter(None, render_template(template, **context).split("\n")))
 
 
 def headlines(metrics: Metrics) -> list[dict[str, str]]:

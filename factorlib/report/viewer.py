@@ -20,16 +20,16 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.gltf_writer import read_part_materials, variant_name
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
+from factorlib.geometry.occlusion import LIFT, Occluders, SurfacePoints
 from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.geometry.visibility import LIFT, Occluders, SurfacePoints
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.poses import AS_IT_IS
-from factorlib.tracing.scene import sharpened
+from factorlib.tracing.scene import sharpen_lobes
 
 MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
 LONGEST = 0.08  # longest edge, in extents of the mesh
@@ -40,7 +40,7 @@ FACES = (32, 64, 128, 256)  # possible numbers of texels across a face of the cu
 FINE_ENOUGH = 0.7  # largest texel, in widths 1/√λ of the sharpest lobe
 
 
-def viewed(
+def viewer_data(
     run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]
 ) -> dict[str, Any] | None:
     """Return the viewer's data; None if no light or no material was exported.
@@ -71,21 +71,21 @@ def viewed(
         turn = YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)) @ YUP_FROM_CAMERA.T
         photo = {"name": name, "light": lights[name].illumination, "rotation": turn.ravel().tolist()}
         photos.append(photo | {"gain": run.exposures.get(name, (1.0,) * 3), "exposure": exposure[name]})
-    drawn = {name: _light(each) for name, each in lobes.items()}
-    return {**_objects(run, objects), "materials": materials, "lights": drawn, "photos": photos}
+    light_data = {name: _light(each) for name, each in lobes.items()}
+    return {**_objects(run, objects), "materials": materials, "lights": light_data, "photos": photos}
 
 
 def _light(lobes: Lobes) -> dict[str, Any]:
     texel = FINE_ENOUGH / np.sqrt(lobes.sharpness.max(initial=1.0))
-    face = next((n for n in FACES if spacing_of(n) <= texel), FACES[-1])
-    lobes = sharpened(lobes, spacing_of(face)).turned(YUP_FROM_CAMERA)
+    face = next((n for n in FACES if texel_spacing(n) <= texel), FACES[-1])
+    lobes = sharpen_lobes(lobes, texel_spacing(face)).rotate(YUP_FROM_CAMERA)
     return {"face": face, "lobes": _base64(np.column_stack([lobes.axis, lobes.sharpness, lobes.weight]), "<f4")}
 
 
-def spacing_of(face: int) -> float:
+def texel_spacing(face: int) -> float:
     """Return the mean angle between texels of a cube map, in radians.
 
-    >>> round(spacing_of(64), 4)
+    >>> round(texel_spacing(64), 4)
     0.0226
     """
     return float(np.sqrt(4 * np.pi / (6 * face**2)))
@@ -163,7 +163,7 @@ def _mesh(
     vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
-    pieces = [_simplified(part, share) for _, part in sorted(parts.items())]
+    pieces = [_simplify(part, share) for _, part in sorted(parts.items())]
     vertices, normals, faces = zip(*pieces, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
     labels = np.arange(1, len(pieces) + 1, dtype=np.int16)
@@ -231,21 +231,23 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     points = SurfacePoints(sides.vertices + LIFT * mesh.radius * outward, outward, np.ones(len(outward), bool))
     pairs = []
     for vertex, k, face, turned in occluders.hidden_from(points, sides.normals, directions):
-        met = mesh.faces[face, 0].astype(np.int64)
+        hit_vertex = mesh.faces[face, 0].astype(np.int64)
         # a hit on the back of a triangle is on the mesh's other side, or inside a closed mesh, which is black
-        behind = np.sum(occluders.hit_normals(face, turned) * mesh.normals[met], 1) < 0
-        met = np.where((face < 0) | behind & (not mesh.open), len(outward), met + np.where(behind, single, 0))
-        pairs.append(np.stack([vertex, k, met])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
-    vertex, k, met = np.concatenate(pairs, axis=1)
+        is_back = np.sum(occluders.hit_normals(face, turned) * mesh.normals[hit_vertex], 1) < 0
+        hit_vertex = np.where(
+            (face < 0) | is_back & (not mesh.open), len(outward), hit_vertex + np.where(is_back, single, 0)
+        )
+        pairs.append(np.stack([vertex, k, hit_vertex])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
+    vertex, k, hit_vertex = np.concatenate(pairs, axis=1)
     return {
         "directions": _base64(directions, "<f4"),
         "counts": _base64(np.bincount(vertex, minlength=len(outward)), "<u2"),
         "hidden": _base64(k, "u1"),
-        "met": _base64(met, "<u2" if len(outward) < 1 << 16 else "<u4"),
+        "met": _base64(hit_vertex, "<u2" if len(outward) < 1 << 16 else "<u4"),
     }
 
 
-def _simplified(
+def _simplify(
     part: trimesh.Trimesh, share: float
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Return vertices, normals and triangles of a part, simplified to `share` of its triangles by quadric error."""

@@ -55,7 +55,7 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
     return {name: Lobes(part[:, :3].copy(), part[:, 3].copy(), part[:, 4:].copy()) for name, part in parts.items()}
 
 
-def light_of(exported: Path, photo: str, light: LightSlice) -> Lobes:
+def read_photo_light(exported: Path, photo: str, light: LightSlice) -> Lobes:
     """Read the light of a photo in the photo's own camera axes, with its exposure applied.
 
     Args:
@@ -67,5 +67,5 @@ def light_of(exported: Path, photo: str, light: LightSlice) -> Lobes:
     if len(lobes) == 0:
         log.warning("%s: nothing is known of its light: its pictures are black", photo)
     if light.world_from_camera is not None:
-        lobes = lobes.turned(np.array(light.world_from_camera).T)
-    return lobes.scaled(np.array(read_exposures(exported / "exposures.json").get(photo, 1.0)))
+        lobes = lobes.rotate(np.array(light.world_from_camera).T)
+    return lobes.scale(np.array(read_exposures(exported / "exposures.json").get(photo, 1.0)))

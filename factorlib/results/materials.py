@@ -69,7 +69,7 @@ class Kind(msgspec.Struct, frozen=True):
     probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
-class Solved(Reflectance, frozen=True):
+class SolvedMaterial(Reflectance, frozen=True):
     """A solved material with its standard errors.
 
     Attributes:
@@ -128,14 +128,14 @@ class Decision(msgspec.Struct, frozen=True):
         log_bayes_factor: log marginal likelihood with it, less that without it
     """
 
-    kept: bool
+    accepted: bool = msgspec.field(name="kept")
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
     margin: float | None = None
     log_bayes_factor: float | None = None
 
 
-class Started(msgspec.Struct, frozen=True):
+class WarmStart(msgspec.Struct, frozen=True):
     """Materials and illuminations taken over from an earlier solution."""
 
     materials: list[str]
@@ -174,7 +174,7 @@ class Model(msgspec.Struct, frozen=True):
     tone_chosen_by: dict[str, Decision] = {}
     distance: dict[str, Positive] = {}
     distance_chosen_by: dict[str, Decision] = {}
-    started_from: Started | UnsetType = UNSET
+    started_from: WarmStart | UnsetType = UNSET
 
     def curvature(self, illumination: str) -> float:
         """Return one over the distance of a light; 0 for a light at infinity."""
@@ -184,7 +184,7 @@ class Model(msgspec.Struct, frozen=True):
 class MaterialTable(msgspec.Struct, frozen=True):
     """Content of materials.json."""
 
-    materials: dict[str, Solved]
+    materials: dict[str, SolvedMaterial]
     gauge: Gauge = Gauge()
     model: Model = Model()
 
@@ -219,22 +219,22 @@ class Uncertainty(msgspec.Struct, frozen=True):
     photos: dict[str, Misfit] = {}
 
 
-def solved(
+def attach_errors(
     reflectance: Reflectance,
     stderr: StandardErrors,
     kind: Kind | UnsetType = UNSET,
-    given: list[str] | UnsetType = UNSET,
-) -> Solved:
+    given_fields: list[str] | UnsetType = UNSET,
+) -> SolvedMaterial:
     """Combine a reflectance with its standard errors.
 
     Args:
         reflectance: the reflectance
         stderr: its standard errors
         kind: class of the material
-        given: parts of the reflectance that were known beforehand
+        given_fields: parts of the reflectance that were known beforehand
     """
     rows = reflectance.diffuse, reflectance.specular, reflectance.roughness
-    return Solved(*rows, reflectance.roughness**2, stderr, kind, given)
+    return SolvedMaterial(*rows, reflectance.roughness**2, stderr, kind, given_fields)
 
 
 def read_uncertainty(path: str | Path) -> Uncertainty:
@@ -252,7 +252,7 @@ def reflectances(table: MaterialTable) -> dict[str, Reflectance]:
     return {name: material.reflectance for name, material in table.materials.items()}
 
 
-def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> list[Solved]:
+def select_materials(table: MaterialTable, names: Sequence[str], path: str | Path) -> list[SolvedMaterial]:
     """Return the materials called `names`, in that order.
 
     Args:

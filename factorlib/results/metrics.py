@@ -57,14 +57,14 @@ class PictureError(msgspec.Struct, frozen=True):
 Error = TypeVar("Error")
 
 
-class Scored(msgspec.Struct, Generic[Error], frozen=True):
+class ErrorWithNull(msgspec.Struct, Generic[Error], frozen=True):
     """Error of an estimate, and error of a null, the trivial guess that it must beat."""
 
     estimate: Error
     null: Error
 
 
-ScoredPicture = Scored[PictureError]
+ScoredPicture = ErrorWithNull[PictureError]
 
 
 class PhotoErrors(msgspec.Struct, frozen=True):
@@ -219,7 +219,7 @@ class LightError(msgspec.Struct, frozen=True):
     rgb_angle_deg: float
 
 
-ScoredLight = Scored[LightError]
+ScoredLight = ErrorWithNull[LightError]
 
 
 class LightErrors(msgspec.Struct, frozen=True):

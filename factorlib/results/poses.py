@@ -97,7 +97,7 @@ class PhotoPoses(msgspec.Struct, frozen=True):
     objects: dict[str, ObjectPose]
 
 
-def entry_of(pose: Pose) -> dict[str, Any]:
+def pose_fields(pose: Pose) -> dict[str, Any]:
     """Return a pose as the fields of a `PoseEntry`."""
     return {"rotation": tuple(map(vec3, pose.rotation)), "translation": vec3(pose.translation)}
 

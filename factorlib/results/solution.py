@@ -14,7 +14,7 @@ FILES = ("materials.json", "lobes.parquet", "exposures.json")
 CURE = "name the folder of a result of `solve`, as it was written"
 
 
-class Earlier(msgspec.Struct, frozen=True):
+class EarlierSolution(msgspec.Struct, frozen=True):
     """An earlier solution, from which a solve starts.
 
     Attributes:
@@ -36,20 +36,20 @@ class Earlier(msgspec.Struct, frozen=True):
         """`on` or `off` as chosen, if both were tried; else None."""
         return _decided(self.table.model.interreflection, self.table.model.interreflection_chosen_by)
 
-    def beside(self, relative: dict[str, float]) -> "Earlier":
+    def with_relative_exposures(self, relative: dict[str, float]) -> "EarlierSolution":
         """Return the solution with exposures relative to those that the photos' radiances are divided by."""
         exposures = {p: tuple(e / relative.get(p, 1.0) for e in each) for p, each in self.exposures.items()}
         return msgspec.structs.replace(self, exposures=exposures)
 
 
-def _decided(kept: bool, chosen_by: dict[str, float]) -> str | None:
-    return ("on" if kept else "off") if chosen_by.keys() & {"margin", "log_bayes_factor"} else None
+def _decided(accepted: bool, chosen_by: dict[str, float]) -> str | None:
+    return ("on" if accepted else "off") if chosen_by.keys() & {"margin", "log_bayes_factor"} else None
 
 
-def read_earlier(folder: Path) -> Earlier:
+def read_earlier_solution(folder: Path) -> EarlierSolution:
     """Read the solution in a folder; InputError for files that the stage `solve` did not write."""
     table, lobes, exposures = (folder / name for name in FILES)
-    earlier = Earlier(read_materials(table, CURE), read_lobes(lobes, CURE), read_exposures(exposures, CURE))
+    earlier = EarlierSolution(read_materials(table, CURE), read_lobes(lobes, CURE), read_exposures(exposures, CURE))
     fault = None
     path = lobes
     if set(earlier.table.gauge.component) != set(earlier.table.materials):

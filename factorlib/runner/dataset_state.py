@@ -5,20 +5,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.reading import check_plain, reading
-from factorlib.runner.closure import Sources
-from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
+from factorlib.runner.plan import Listing, PlannedStep, Record, Spec, Step, plan
 from factorlib.runner.project import (
     ALL,
-    DATASET,
-    LIBRARY,
     MOST_CORES,
     Data,
     Pipeline,
@@ -29,8 +24,9 @@ from factorlib.runner.project import (
     read_pipeline,
     with_settings,
 )
-from factorlib.runner.results_folder import ResultsFolder, results_of, set_link, view_of
-from factorlib.runner.store import FileHashes, Store
+from factorlib.runner.results_folder import ResultsFolder, make_view, results_of, set_link
+from factorlib.runner.step_records import StepInputs, step_records
+from factorlib.runner.store import Store
 from factorlib.wholefile import replace_file
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
@@ -49,13 +45,6 @@ class Request(NamedTuple):
     settings: Sequence[str] = ()
     force: bool = False
     recipes: Sequence[str] = ()
-
-
-class StepInputs(NamedTuple):
-    """Facts of the dataset or recipe for a step, and files by their names in the record."""
-
-    facts: dict[str, Any]
-    files: dict[str, Path]
 
 
 @dataclass
@@ -85,7 +74,7 @@ class DatasetState:
     recipes: dict[str, Recipe]
     settings: Sequence[str]
 
-    def plan(self, forced: frozenset[Step] | None = None) -> list[Planned]:
+    def plan(self, forced: frozenset[Step] | None = None) -> list[PlannedStep]:
         """Plan every step; `forced`, if given, replaces the steps that must run in any case."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
@@ -107,7 +96,7 @@ class DatasetState:
                 faults += self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)
         return list(dict.fromkeys(map(str, faults)))
 
-    def parameter_faults(self, planned: list[Planned]) -> list[str]:
+    def parameter_faults(self, planned: list[PlannedStep]) -> list[str]:
         """List the faults of the parameters of steps that are not current.
 
         Only stages with parameters are imported, each in a process, because that takes seconds.
@@ -124,7 +113,7 @@ class DatasetState:
         # A module that cannot be loaded reports that when it runs.
         return [str(blame_setting(error, self.settings)) for error in errors if isinstance(error, InputError)]
 
-    def publish(self, planned: list[Planned]) -> None:
+    def publish(self, planned: list[PlannedStep]) -> None:
         """Make the links in the results folder, and current.json, name the current results."""
         stages = self.spec.pipeline.stages
         current = {p.step: p for p in planned if p.status == "current"}
@@ -132,7 +121,7 @@ class DatasetState:
         links = {str(step): self.store.trees / p.output for step, p in current.items() if not step.photo}
         for name in (name for name, stage in stages.items() if stage.over == "photo"):
             if outputs := {step.photo: p.output for step, p in current.items() if step.photo and step.stage == name}:
-                links[name] = view_of(self.store, outputs, stages[name].gather)
+                links[name] = make_view(self.store, outputs, stages[name].gather)
         for name, folder in links.items():
             set_link(self.results.folder / name, folder, self.project.build)
         for link in self.results.folder.glob("[!.]*"):  # Hidden ones are drafts of links, perhaps of another run.
@@ -178,7 +167,7 @@ def read_state(project: Project, request: Request, look: bool = False) -> Datase
         if request.force:
             forced = frozenset(step for name in targets or present.stages for step in spec.steps_of(name))
             spec = msgspec.structs.replace(spec, forced=forced)
-        records, inputs = _records(project, spec, data, store.hashes, recipes)
+        records, inputs = step_records(project, spec, data, store.hashes, recipes)
     except InputError as error:
         raise blame_setting(error, request.settings) from None
     store.hashes.save()
@@ -197,44 +186,3 @@ def _targets(pipeline: Pipeline, request: Request, look: bool) -> tuple[list[str
         return over_recipes, request.recipes
     usual = [name for name, stage in pipeline.stages.items() if not stage.optional]
     return list(dict.fromkeys([*(usual if targets is None else targets), *over_recipes])), request.recipes
-
-
-def _records(
-    project: Project, spec: Spec, data: Data, hashes: FileHashes, recipes: dict[str, Recipe]
-) -> tuple[dict[Step, Record], dict[Step, StepInputs]]:
-    """Return every step's record without the results of other steps, and its inputs; files count by their content."""
-    sources = Sources([project.code_root, LIBRARY], hashes)
-    records: dict[Step, Record] = {}
-    inputs: dict[Step, StepInputs] = {}
-    for name in spec.pipeline.needed(spec.targets):
-        stage = spec.pipeline.stages[name]
-        common = {"stage": name, "threads": stage.threads, "makes": stage.makes}
-        common |= sources.closure(project.package, name, project.pipeline_file).record
-        common |= {f"param:{param}": value for param, value in stage.values.items()}
-        for step in spec.steps_of(name):
-            record: Record = common | {"photo": step.photo}
-            facts: dict[str, Any] = {}
-            if step.photo is None:
-                gathered = {f"gathered:{each}": spec.pipeline.stages[each].gather for each in stage.upstream}
-                record |= {field: file for field, file in gathered.items() if file}
-            files = {f"given:{p}/{file}": path / file for p, path in stage.folders.items() for file in stage.given[p]}
-            for each in stage.slices:
-                slice_ = data.slice(each, step.photo)
-                facts[DATASET + each] = slice_.facts
-                record |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
-                files |= {f"file:{file}": data.folder / file for file in slice_.files}
-            if step.recipe is not None:
-                recipe = recipes[step.recipe]
-                facts["recipe"] = recipe.facts
-                record |= {"recipe": step.recipe} | {f"recipe:{k}": value for k, value in recipe.facts.items()}
-                files |= {f"recipe file:{file}": path for file, path in recipe.files.items()}
-            records[step] = record | {field: _hash(field, path, name, hashes) for field, path in files.items()}
-            inputs[step] = StepInputs(facts, files)
-    return records, inputs
-
-
-def _hash(field: str, path: Path, stage: str, hashes: FileHashes) -> str:
-    key = f"{stage}.{field.removeprefix('given:').partition('/')[0]}" if field.startswith("given:") else None
-    check_plain(path, "a file", key, most_bytes=None)  # a pipe never ends
-    with reading("a file", path, key):
-        return hashes.content(path)

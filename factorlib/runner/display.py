@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, TextIO, cast
 
-from factorlib.runner.plan import Planned, Step
+from factorlib.runner.plan import PlannedStep, Step
 
 BEAT = 10.0  # seconds of silence after which progress is a line, away from a terminal
 
@@ -84,7 +84,7 @@ class Display:
         self._line_time = time.monotonic()
         self._bars.start()
 
-    def plan(self, planned: list[Planned]) -> None:
+    def plan(self, planned: list[PlannedStep]) -> None:
         """Show the state of a plan."""
         self.stages = {}
         for p in planned:
@@ -140,9 +140,11 @@ class Display:
         """Set the bar of a stage."""
         total, left = self.stages.get(stage, (1, 1))
         running = {step: state for step, state in self._running.items() if step.stage == stage}
-        done = total - left + sum(share for share, _ in running.values())
+        completed = total - left + sum(share for share, _ in running.values())
         words = "; ".join(f"{step.item} {text}".strip() for step, (_, text) in running.items())[:80]
-        self._bars.update(self._rows[stage], completed=done, total=total, count=f"{total - left}/{total}", words=words)
+        self._bars.update(
+            self._rows[stage], completed=completed, total=total, count=f"{total - left}/{total}", words=words
+        )
 
     def close(self) -> None:
         """Remove the bars and release the terminal."""

@@ -78,7 +78,7 @@ class Listing(msgspec.Struct, frozen=True):
     damaged: Mapping[str, list[str]] = {}
 
 
-class Planned(msgspec.Struct, frozen=True):
+class PlannedStep(msgspec.Struct, frozen=True):
     """Step with its status and the reasons for it.
 
     `record` and `key` are empty until all inputs are made, `output` until the step itself is.
@@ -92,16 +92,16 @@ class Planned(msgspec.Struct, frozen=True):
     output: str = ""
 
 
-def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Planned]:
+def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[PlannedStep]:
     """Plan every requested step in order; `hashes` holds each step's record without the results of other steps."""
-    planned: dict[Step, Planned] = {}
+    planned: dict[Step, PlannedStep] = {}
     for step in spec.steps():
         outputs = {above: planned[above].output for above in spec.upstream(step)}
         planned[step] = _plan_step(step, step in spec.forced, hashes[step], outputs, listing)
     return list(planned.values())
 
 
-def _plan_step(step: Step, forced: bool, base: Record, outputs: Mapping[Step, str], listing: Listing) -> Planned:
+def _plan_step(step: Step, forced: bool, base: Record, outputs: Mapping[Step, str], listing: Listing) -> PlannedStep:
     """Plan a step that takes these outputs, empty where one is still to be made.
 
     With such an input the step must run if something else of its record changed; otherwise that is open.
@@ -111,18 +111,18 @@ def _plan_step(step: Step, forced: bool, base: Record, outputs: Mapping[Step, st
     whole: Record = {} if missing else record
     key = "" if missing else hash_of(record)
     if forced:
-        return Planned(step, "to run", ["forced"], whole, key)
+        return PlannedStep(step, "to run", ["forced"], whole, key)
     if key and (output := listing.outputs.get(key)) is not None:
-        return Planned(step, "current", [], record, key, output)
+        return PlannedStep(step, "current", [], record, key, output)
     if key and (faults := listing.damaged.get(key)):
-        return Planned(step, "to run", [f"its result is damaged: {summarize(faults)}"], whole, key)
+        return PlannedStep(step, "to run", [f"its result is damaged: {summarize(faults)}"], whole, key)
     if (before := listing.previous.get(str(step))) is None:
-        return Planned(step, "to run", ["not made yet"], whole, key)
+        return PlannedStep(step, "to run", ["not made yet"], whole, key)
     pending = {f"input:{above}" for above in missing}
     changes = difference({name: value for name, value in before.items() if name not in pending}, record)
     if missing and not changes:
-        return Planned(step, "maybe", [f"if {names(missing)} comes out different"])
-    return Planned(step, "to run", changes or ["its result is gone"], whole, key)
+        return PlannedStep(step, "maybe", [f"if {names(missing)} comes out different"])
+    return PlannedStep(step, "to run", changes or ["its result is gone"], whole, key)
 
 
 def hash_of(table: Record) -> str:

@@ -78,7 +78,7 @@ def restore_sigterm() -> None:
 
 def photo_sets() -> Provider:
     """Return the reader of datasets with a dataset.yaml."""
-    from factorlib.dataset.read import read_dataset
+    from factorlib.dataset.read_dataset import read_dataset
     from factorlib.dataset.slices import SLICES, dataset_slice
 
     def read(path: Path) -> Data:
@@ -88,7 +88,7 @@ def photo_sets() -> Provider:
 
         def recipe(file: Path) -> Recipe:
             """Read a recipe."""
-            from factorlib.recipe.read import files_of, read_recipe
+            from factorlib.recipe.read_recipe import files_of, read_recipe
 
             content = read_recipe(file, dataset)
             return Recipe(msgspec.to_builtins(content), files_of(content, file))
@@ -153,8 +153,8 @@ class Project(msgspec.Struct, frozen=True):
 
     def short_path(self, path: Path) -> str:
         """Format a path for messages: relative to the current folder if it lies below."""
-        here = Path.cwd()
-        return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
+        cwd = Path.cwd()
+        return str(path.relative_to(cwd)) if path.is_relative_to(cwd) else str(path)
 
     def dataset_folder(self, name: str) -> Path:
         """Return the folder of a dataset by its name in data/ or its path; InputError if there is none."""
@@ -214,8 +214,8 @@ def check_name(name: str, kind: str, *, file: Any = None, key: str | None = None
     """
     usable = name.isprintable() and "/" not in name and len(name.encode()) <= LONGEST
     if not usable or name in ("", ".", "..", *reserved):
-        taken = f"; the names {', '.join(reserved)} are reserved" if reserved else ""
-        cure = f"rename it: printable characters, at most {LONGEST} bytes, no slash{taken}"
+        reserved_names = f"; the names {', '.join(reserved)} are reserved" if reserved else ""
+        cure = f"rename it: printable characters, at most {LONGEST} bytes, no slash{reserved_names}"
         raise InputError(f"{kind} cannot be called {name!r}", file=file, key=key, cure=cure)
 
 
@@ -337,11 +337,11 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def for_data(self, is_empty: Callable[[str], bool]) -> Pipeline:
         """Return the pipeline without the stages whose slice (`Stage.when`) is empty in a dataset."""
-        gone = {name for name, stage in self.stages.items() if stage.when and is_empty(stage.when)}
-        rest = {name: stage for name, stage in self.stages.items() if name not in gone}
-        for name, stage in rest.items():
-            rest[name] = msgspec.structs.replace(stage, inputs=[each for each in stage.inputs if each not in gone])
-        return msgspec.structs.replace(self, stages=rest)
+        dropped = {name for name, stage in self.stages.items() if stage.when and is_empty(stage.when)}
+        stages = {name: stage for name, stage in self.stages.items() if name not in dropped}
+        for name, stage in stages.items():
+            stages[name] = msgspec.structs.replace(stage, inputs=[each for each in stage.inputs if each not in dropped])
+        return msgspec.structs.replace(self, stages=stages)
 
     def needed(self, targets: list[str] | None) -> list[str]:
         """Return the targets and all stages above them, in order; None stands for all stages that are not optional."""

@@ -6,9 +6,7 @@
     recipes/      links to the current pictures of each recipe
     dataset.txt   the dataset; only a folder with this file was made by the runner
 
-A view, in store/views, has the files of all photos of a stage in one folder, as hard links.  Each run has a folder in
-store/tmp and holds a lock in it while it lives.  The operating system frees the lock of a killed run, so its folder can
-be deleted, and there is no unlock command.
+A view, in store/views, has the files of all photos of a stage in one folder, as hard links.
 """
 
 from __future__ import annotations
@@ -19,9 +17,8 @@ import shlex
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -29,21 +26,9 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.plan import Step, hash_of
 from factorlib.runner.project import RESERVED, SHARED, Project, check_name
-from factorlib.runner.store import (
-    DECODE_ERRORS,
-    LOCK,
-    Entry,
-    Hash,
-    Store,
-    is_locked,
-    lock,
-    remove_killed_runs,
-    stamps_of,
-)
+from factorlib.runner.run_folder import no_runs
+from factorlib.runner.store import DECODE_ERRORS, Entry, Hash, Store, stamps_of
 from factorlib.wholefile import replace_file, write_text
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 NO_STAGE = "left over"  # damaged results, and files without a key
 
@@ -119,7 +104,7 @@ def find_results(project: Project, dataset: str | None) -> list[ResultsFolder]:
     folder = project.find_dataset(dataset)
     results = results_of(project, folder or Path(os.path.abspath(dataset)))
     if folder is None and not results.mark.is_file():
-        known = [other.folder.name for other in all_results(project)]
+        known = [folder_results.folder.name for folder_results in all_results(project)]
         cure = did_you_mean(dataset, known) if known else "build/ holds no results of any dataset"
         raise InputError(f"there is no dataset {dataset!r}, and no results of one", key="DATASET", cure=cure)
     return [results] if results.mark.is_file() else []
@@ -139,7 +124,7 @@ def set_link(link: Path, target: Path, build: Path) -> None:
     os.replace(draft, link)
 
 
-def view_of(store: Store, outputs: Mapping[str, str], gather: str | None) -> Path:
+def make_view(store: Store, outputs: Mapping[str, str], gather: str | None) -> Path:
     """Return a folder with the files of all photos of a stage, as hard links, and create it if needed.
 
     `outputs` gives the hash of each photo's result.  The file `gather` has the contents of all `<photo>.json`.
@@ -166,31 +151,6 @@ def view_of(store: Store, outputs: Mapping[str, str], gather: str | None) -> Pat
     return view
 
 
-def begin_run(store: Store) -> tuple[Path, BaseFileLock]:
-    """Create a run's folder for unfinished results, and return it with the lock in it that shows that the run lives."""
-    folder = store.tmp / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    with _entrance(store):
-        return folder, lock(folder / LOCK)
-
-
-@contextlib.contextmanager
-def no_runs(store: Store) -> Iterator[None]:
-    """Keep runs from starting while the code inside deletes results; InputError if a run is going on."""
-    with _entrance(store):
-        if any(is_locked(folder / LOCK) for folder in store.tmp.iterdir()):
-            raise InputError("a run is going on", file=store.root, cure="wait until it has ended")
-        yield
-
-
-@contextlib.contextmanager
-def _entrance(store: Store) -> Iterator[None]:
-    """Admit one command at a time; the folders of killed runs are deleted first."""
-    store.tmp.mkdir(parents=True, exist_ok=True)
-    with lock(store.root / "door.lock", wait=True):
-        remove_killed_runs(store.tmp)
-        yield
-
-
 # ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -208,7 +168,7 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
         )
         raise InputError(fault, file=store.root, cure=cure)
     with no_runs(store):
-        keys, trees, rest = _unused(project, store)
+        keys, trees, leftovers = _unused(project, store)
         stages = {entry.output: entry.record["stage"] for path in keys if (entry := store.entry(path.stem))}
         groups: dict[str, list[Path]] = {}
         for path in trees:
@@ -216,12 +176,12 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
         for stage, paths in groups.items():
             size = sum(file.stat().st_size for path in paths for file in path.rglob("*") if file.is_file())
             dates = sorted(time.strftime("%Y-%m-%d", time.localtime(path.stat().st_mtime)) for path in paths)
-            made = " to ".join(dict.fromkeys((dates[0], dates[-1])))
-            print(f"{stage:<10} {_results(len(paths)):>12} {size / 1e6:>9.1f} MB   of {made}")
+            period = " to ".join(dict.fromkeys((dates[0], dates[-1])))
+            print(f"{stage:<10} {_results(len(paths)):>12} {size / 1e6:>9.1f} MB   of {period}")
         if groups and not confirm():
             print("nothing was deleted")
             return 0
-        for path in keys + trees + rest:
+        for path in keys + trees + leftovers:
             if path.is_dir() and not path.is_symlink():  # renamed first: a part would count as a damaged result
                 aside = store.tmp / f"run-gc-{path.name}"
                 os.rename(path, aside)
@@ -242,10 +202,11 @@ def _unused(project: Project, store: Store) -> tuple[list[Path], list[Path], lis
     keys = _needed(store, {key for table in current for key in table.values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
     unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
-    rest = [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
+    leftovers = [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
     linked = {os.path.realpath(link) for link in project.build.glob("*/*") if link.is_symlink()}
-    rest += [view for view in store.views.glob("*") if os.path.realpath(view) not in linked]
-    return unused, [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees], rest
+    leftovers += [view for view in store.views.glob("*") if os.path.realpath(view) not in linked]
+    orphans = [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees]
+    return unused, orphans, leftovers
 
 
 def _needed(store: Store, current: set[str]) -> set[str]:

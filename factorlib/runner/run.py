@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING
 from factorlib.errors import InputError
 from factorlib.runner.dataset_state import DatasetState
 from factorlib.runner.display import Display
-from factorlib.runner.plan import Planned, Step
-from factorlib.runner.results_folder import begin_run, view_of
+from factorlib.runner.plan import PlannedStep, Step
+from factorlib.runner.results_folder import make_view
+from factorlib.runner.run_folder import begin_run
 from factorlib.runner.store import lock
 from factorlib.runner.worker import Outcome, StageCode, Task, Workers, run_step
 from factorlib.wholefile import append_text, write_text
@@ -82,7 +83,7 @@ class Run:
         self.completed: set[Step] = set()
         self.failed: dict[Step, Outcome] = {}
         self.held_up: list[Step] = []
-        self.planned: dict[Step, Planned] = {}
+        self.planned: dict[Step, PlannedStep] = {}
         self.stale = True  # There are results that the plan does not know.
 
     def execute(self) -> None:
@@ -108,7 +109,7 @@ class Run:
             error = f"{p.reasons[0]}, although it was made in this run: is the disk failing?"
             self._fail(p.step, Outcome(error=error))
 
-    def _start(self, planned: Planned) -> None:
+    def _start(self, planned: PlannedStep) -> None:
         """Start a step if its cores and its lock are free."""
         step = planned.step
         code = self.state.code(step.stage)
@@ -116,21 +117,21 @@ class Run:
         if step in self.running or step in self.failed or step in self.completed or not self.workers.free(cores):
             return
         try:
-            taken = lock(self.store.locks / f"{planned.key}.lock")
+            step_lock = lock(self.store.locks / f"{planned.key}.lock")
         except TimeoutError:
             self.waiting.add(planned.key)
             return self.display.report_once(f"{step}: waiting: another run is making it")
         self.store.forget([planned.key])
         if self.store.get(planned.key) is not None and "forced" not in planned.reasons:
-            taken.release()  # Another run has made it meanwhile.
+            step_lock.release()  # Another run has made it meanwhile.
             self.stale = True
         else:
             self.display.start(step)
             task = self._task(planned, code)
             future = self.workers.submit(cores, code.threads, run_step, task)
-            self.running[step] = RunningStep(step, task, taken, future)
+            self.running[step] = RunningStep(step, task, step_lock, future)
 
-    def _task(self, planned: Planned, code: StageCode) -> Task:
+    def _task(self, planned: PlannedStep, code: StageCode) -> Task:
         step = planned.step
         stage = self.state.spec.pipeline.stages[step.stage]
         inputs = self.state.inputs[step]
@@ -157,7 +158,7 @@ class Run:
         if not stage.over or step.photo is not None:
             return self.store.trees / self.planned[Step(name, step.photo if stage.over else None)].output
         outputs = {each.item: self.planned[each].output for each in spec.steps_of(name)}
-        return view_of(self.store, outputs, stage.gather)
+        return make_view(self.store, outputs, stage.gather)
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """Write the logs of the current results of all stages above, whichever run made them."""
@@ -169,15 +170,15 @@ class Run:
     def _wait(self) -> None:
         """Wait for outcomes or events; the plan is stale if there are outcomes, or another run makes a step."""
         futures = {work.future: step for step, work in self.running.items()}
-        done = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED).done if futures else set()
+        finished = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED).done if futures else set()
         if not futures:
             time.sleep(POLL)
         for work in self.running.values():
             self._read_events(work)
-        for future in done:
+        for future in finished:
             self._collect(self.running.pop(futures[future]))
         self.store.forget(self.waiting)
-        self.stale |= bool(done or self.waiting)
+        self.stale |= bool(finished or self.waiting)
 
     def _read_events(self, work: RunningStep) -> None:
         """Display the new events of a worker."""

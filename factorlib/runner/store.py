@@ -44,8 +44,6 @@ Stamp = list[int]  # size in bytes, time of the content in ns
 FORMAT = 10  # of the cache; one of another format is ignored
 FRESH_NS = 2_000_000_000  # A file changed this recently may change again within its clock's grain: it is not cached.
 NO_FILE: Stamp = [-1, 0]  # a link, a pipe: nothing that a stage may write
-LOCK = "lock"  # in the folder of a run, which holds it
-ABANDONED = 86400.0  # seconds without a change after which a draft outside a run is of a killed process
 DECODE_ERRORS = (OSError, msgspec.MsgspecError, UnicodeError, RecursionError)
 
 
@@ -239,9 +237,9 @@ def lock(path: Path, wait: bool = False) -> BaseFileLock:
     from filelock import FileLock  # A run with nothing to do does not load it.
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    taken = FileLock(path, mode=0o664, thread_local=False)
-    taken.acquire(timeout=-1 if wait else 0)
-    return taken
+    file_lock = FileLock(path, mode=0o664, thread_local=False)
+    file_lock.acquire(timeout=-1 if wait else 0)
+    return file_lock
 
 
 def is_locked(path: Path) -> bool:
@@ -252,14 +250,6 @@ def is_locked(path: Path) -> bool:
     except OSError as error:
         return isinstance(error, TimeoutError)
     return False
-
-
-def remove_killed_runs(folder: Path) -> None:
-    """Delete the folders of runs whose lock is free, and drafts without a change for a day."""
-    for path in (path for path in folder.iterdir() if path.is_dir() and not is_locked(path / LOCK)):
-        with contextlib.suppress(FileNotFoundError):
-            if path.name.startswith("run-") or time.time() - path.stat().st_mtime > ABANDONED:
-                shutil.rmtree(path, ignore_errors=True)
 
 
 def stamps_of(folder: str | Path, prefix: str = "") -> dict[str, Stamp]:
@@ -284,9 +274,9 @@ def finish_tree(folder: Path) -> dict[str, str]:
         InputError: There is a link or a pipe.
     """
     stamps = sorted(stamps_of(folder).items())
-    if other := next((name for name, stamp in stamps if stamp == NO_FILE), None):
-        fault = f"a stage wrote {other!r}, which is a link or a device"
-        raise InputError(fault, file=folder / other, cure="make the stage write a plain file")
+    if special := next((name for name, stamp in stamps if stamp == NO_FILE), None):
+        fault = f"a stage wrote {special!r}, which is a link or a device"
+        raise InputError(fault, file=folder / special, cure="make the stage write a plain file")
     for name, _ in stamps:
         (folder / name).chmod(0o444)
     sync_tree(folder)

@@ -21,7 +21,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.dataset_state import DatasetState, Request, read_state
-from factorlib.runner.plan import Planned, Step, difference, summarize
+from factorlib.runner.plan import PlannedStep, Step, difference, summarize
 from factorlib.runner.project import RESERVED, Pipeline, Project, StageCode, check_name, read_pipeline
 from factorlib.runner.results_folder import ResultsFolder, all_results, find_results, results_of
 from factorlib.runner.store import Entry, Store, is_locked
@@ -85,7 +85,7 @@ def _print_results(state: DatasetState, whole: bool) -> str:
     return verdict
 
 
-def _run(state: DatasetState, planned: list[Planned]) -> int:
+def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
     from factorlib.runner.display import Display
     from factorlib.runner.run import run
 
@@ -106,9 +106,9 @@ def _run(state: DatasetState, planned: list[Planned]) -> int:
         if result.held_up:
             print(f"not run because of that: {', '.join(dict.fromkeys(step.stage for step in result.held_up))}")
         return 1
-    done = len(result.completed)
+    completed = len(result.completed)
     seconds = time.perf_counter() - started
-    print(f"{name}: {count(result.completed)} run, {len(state.records) - done} current, {seconds:.1f} s")
+    print(f"{name}: {count(result.completed)} run, {len(state.records) - completed} current, {seconds:.1f} s")
     return 0
 
 
@@ -146,7 +146,7 @@ def show_status(project: Project, request: Request) -> int:
     return 0
 
 
-def _result(state: DatasetState, planned: Planned) -> Entry | None:
+def _result(state: DatasetState, planned: PlannedStep) -> Entry | None:
     """Return the result of a current step."""
     return state.store.entry(planned.key) if planned.status == "current" else None
 
@@ -245,7 +245,7 @@ def _draw_sheet(project: Project, folder: Path) -> None:
     with contextlib.closing(Display()) as display:
         display.start(step)
         progress = partial(display.progress, step, text="")
-        import_module("factorlib.sheet").write_sheet(folder, path, progress)  # by name: it is science
+        import_module("factorlib.contact_sheet").write_sheet(folder, path, progress)  # by name: it is science
     print(f"  contact sheet: {project.short_path(path)}")
 
 
@@ -256,9 +256,9 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
         raise InputError("no folder of photos is named", key="PHOTOS", cure=cure)
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
-    missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
-    rest = "; still missing, or yours to decide:" if missing else ""
-    print(f"{project.short_path(folder)}/dataset.yaml is written{rest}")
+    missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
+    ending = "; still missing, or yours to decide:" if missing else ""
+    print(f"{project.short_path(folder)}/dataset.yaml is written{ending}")
     for line in missing:
         print(f"  {line}")
     try:
@@ -311,13 +311,13 @@ def _changes(store: Store, first: dict[str, str], second: dict[str, str]) -> lis
 
 def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int:
     """Pack a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
-    from factorlib.pack import pack as write_zip
+    from factorlib.pack import write_pack
 
     if not (folders := find_results(project, dataset)):
         raise InputError(f"{dataset} has no results", key="DATASET", cure=project.command("all", dataset))
     folder = folders[0].folder
     out = out or Path(f"{folder.name}.zip")
-    files = write_zip(folder, out, replace)
+    files = write_pack(folder, out, replace)
     print(f"{folder.name}: {files} files, {out.stat().st_size / 1e6:.1f} MB\n  {out}")
     return 0
 
@@ -335,7 +335,7 @@ BOUNDS = {
 }
 
 
-def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
+def plan_lines(planned: list[PlannedStep], every_reason: bool = False) -> list[str]:
     """Format a plan, with one line for all steps of a stage that have the same reasons but for the photo's name.
 
     every_reason: add a line for each reason

@@ -44,8 +44,8 @@ from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
 from factorlib.runner.plan import difference, hash_of
 from factorlib.runner.project import LIBRARY, Stage, StageCode, restore_sigterm
+from factorlib.runner.run_folder import LOCK
 from factorlib.runner.store import (
-    LOCK,
     Entry,
     Stamp,
     Store,

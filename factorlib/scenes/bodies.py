@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.generate.chair import dowel, legs, shell
-from factorlib.generate.solids import BUMPS, revolved
+from factorlib.generate.solids import BUMPS, revolve
 from factorlib.geometry import open3d as o3d
 from factorlib.meshes.mesh import Mesh, closed_grid
-from factorlib.meshes.read import CREASE_DEG, usable
+from factorlib.meshes.read_mesh import CREASE_DEG, usable
 from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
 
 Part = tuple[np.ndarray, np.ndarray, int]  # vertices [V, 3], faces [F, 3], label
@@ -37,7 +37,7 @@ BODY = ((0.0, 0.5), (0.20, 0.5), (0.22, 0.45), (0.17, 0.34), (0.26, 0.15), (0.34
         (0.0, -0.45))  # the jug's profile: radius, y  # fmt: skip
 
 
-def blob() -> list[Part]:
+def bumpy_ball() -> list[Part]:
     """Return a ball with the bumps of data/synthetic's blob."""
     theta = np.arange(1, ROWS) / ROWS * np.pi
     phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
@@ -74,12 +74,12 @@ def jug() -> list[Part]:
     t = np.linspace(0, 1, 24)
     handle = np.stack([0.2 + 0.32 * np.sin(np.pi * t), 0.4 - 0.55 * t, 0 * t], axis=1)
     spout = np.stack([-0.05 * t, 0.02 + 0.4 * t**1.5, 0.2 + 0.36 * t], axis=1)
-    body = revolved(np.array(BODY))
+    body = revolve(np.array(BODY))
     tubes = tube(handle, np.full(24, 0.04), 2), tube(spout, np.linspace(0.1, 0.05, 24), 2)
     return [(body.vertices, body.faces, 1), *tubes]
 
 
-def chair() -> list[Part]:
+def armed_chair() -> list[Part]:
     """Return the chair of data/eames, of fewer triangles, with an arm on one side."""
     arm = ((0.2, 0.62, -0.2), (0.22, 0.64, 0.15))
     post = ((0.21, 0.43, 0.1), (0.22, 0.66, 0.12))
@@ -87,7 +87,13 @@ def chair() -> list[Part]:
     return [(*shell(48, 72), 1), (*legs(20, 12), 2), *rods]
 
 
-SHAPES: dict[str, Callable[[], list[Part]]] = {"blob": blob, "hook": hook, "stack": stack, "chair": chair, "jug": jug}
+SHAPES: dict[str, Callable[[], list[Part]]] = {
+    "blob": bumpy_ball,
+    "hook": hook,
+    "stack": stack,
+    "chair": armed_chair,
+    "jug": jug,
+}
 
 
 def tube(curve: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, " n"], label: int) -> Part:
@@ -135,17 +141,17 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
 
 
 @cache
-def mesh(shape: str) -> Mesh:
+def photographed_mesh(shape: str) -> Mesh:
     """Return the photographed mesh of a shape, with the normals and checks of a mesh that is read from a file."""
-    return mesh_of(SHAPES[shape](), shape)
+    return mesh_from_parts(SHAPES[shape](), shape)
 
 
 @cache
-def rough(shape: str, seed: int) -> Mesh:
+def rough_mesh(shape: str, seed: int) -> Mesh:
     """Warp the shape of ROUGH_TRIANGLES: each vertex is moved by a smooth field, at most by WARP of the extent."""
     parts = SHAPES[shape]()
     total = sum(len(faces) for _, faces, _ in parts)
-    coarse = [decimated(part, max(round(ROUGH_TRIANGLES * len(part[1]) / total), 8)) for part in parts]
+    coarse = [decimate(part, max(round(ROUGH_TRIANGLES * len(part[1]) / total), 8)) for part in parts]
     vertices = np.concatenate([part[0] for part in coarse])
     extent = float(np.ptp(vertices, axis=0).max())
     rng = np.random.default_rng(seed)
@@ -158,10 +164,10 @@ def rough(shape: str, seed: int) -> Mesh:
         return np.sin(points @ waves.T + phases) @ shifts
 
     scale = WARP * extent / np.linalg.norm(field(vertices), axis=1).max()
-    return mesh_of([(v + scale * field(v), f, label) for v, f, label in coarse], f"rough {shape}")
+    return mesh_from_parts([(v + scale * field(v), f, label) for v, f, label in coarse], f"rough {shape}")
 
 
-def decimated(part: Part, triangles: int) -> Part:
+def decimate(part: Part, triangles: int) -> Part:
     """Decimate the part to about so many triangles, by Open3D's quadric error metrics (Garland and Heckbert 1997)."""
     vertices, faces, label = part
     whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
@@ -169,7 +175,7 @@ def decimated(part: Part, triangles: int) -> Part:
     return np.asarray(few.vertices), np.asarray(few.triangles), label
 
 
-def mesh_of(parts: list[Part], name: str) -> Mesh:
+def mesh_from_parts(parts: list[Part], name: str) -> Mesh:
     """Return the parts as one mesh; `name` is its name in errors."""
     first = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts])
     faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, first)]).astype(np.int64)

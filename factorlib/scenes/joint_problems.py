@@ -45,7 +45,7 @@ def random_light(
     return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, exposure)
 
 
-def block(
+def sphere_block(
     name: str, light: Light, materials: Materials, numbers: Sequence[int], operator: Operator, size: int = 24
 ) -> Block:
     """Return an illumination's observations: in each of its photos a sphere of each material.

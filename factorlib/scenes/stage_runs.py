@@ -42,13 +42,13 @@ def run_stages(
         name = stage.__name__.rpartition(".")[2]
         entry = declared[name]
         folders[name] = out / name
-        chosen = msgspec.convert(params.get(name, {}), stage.Params)
+        stage_params = msgspec.convert(params.get(name, {}), stage.Params)
         slices = [each.removeprefix("dataset.") for each in entry["inputs"] if each.startswith("dataset.")]
         (out / name).mkdir(parents=True)
         for photo in photos if entry.get("over") == "photo" else [None]:
             parts = {each: dataset_slice(dataset, each, photo) for each in slices}
             facts = {f"dataset.{each}": part.facts for each, part in parts.items()}
             files = {file: dataset.folder / file for part in parts.values() for file in part.files}
-            stage.main(chosen, Inputs(dict(folders), facts, files, photo), out / name, silent)
+            stage.main(stage_params, Inputs(dict(folders), facts, files, photo), out / name, silent)
         if "gather" in entry:
             write_json(out / name / entry["gather"], {p: read_json(out / name / f"{p}.json") for p in photos})

@@ -135,7 +135,7 @@ def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"],
 
     The radius is the least extent of an outline, projected back to that point.
     """
-    left = np.zeros((3, 3))
+    normal_matrix = np.zeros((3, 3))
     right = np.zeros(3)
     rays = []
     for outline in outlines:
@@ -145,12 +145,12 @@ def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"],
         ray /= np.linalg.norm(ray)
         # normal equations of the point nearest to all rays: Σ (I − d dᵀ)(x − c) = 0
         across = np.eye(3) - np.outer(ray, ray)
-        left = left + across
+        normal_matrix = normal_matrix + across
         right = right + across @ centre
         rays.append((centre, ray))
-    if np.linalg.cond(left) > 1e8:
+    if np.linalg.cond(normal_matrix) > 1e8:
         raise InputError("all photos see it from the same side", cure="add photos from other sides: a hull needs them")
-    middle = np.linalg.solve(left, right)
+    middle = np.linalg.solve(normal_matrix, right)
     radii = []
     for outline, (centre, ray) in zip(outlines, rays, strict=True):
         depth = float((middle - centre) @ ray)
@@ -198,7 +198,7 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
     count = np.zeros(cells)
     quads = []
     for axis in range(3):
-        other = [k for k in range(3) if k != axis]
+        other_axes = [k for k in range(3) if k != axis]
         first = tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))
         second = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
         crossed = np.argwhere(inside[first] != inside[second])
@@ -210,7 +210,7 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
         around = []
         for down in ((0, 0), (1, 0), (1, 1), (0, 1)):
             cell = crossed.copy()
-            cell[:, other] -= down
+            cell[:, other_axes] -= down
             valid = ((cell >= 0) & (cell < cells)).all(axis=1)
             np.add.at(total, tuple(cell[valid].T), crossing[valid])
             np.add.at(count, tuple(cell[valid].T), 1)

@@ -104,10 +104,10 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
     Raises:
         InputError: If no photo shows the object completely enough to determine its axis.
     """
-    outlines = sorted(map(_without_holes, outlines), key=lambda outline: -int((outline.part > 0).sum()))
+    outlines = sorted(map(_fill_holes, outlines), key=lambda outline: -int((outline.part > 0).sum()))
     if posed := [outline for outline in outlines if outline.pose is not None]:
         poses = [BodyView(NO_PROFILE, outline.known_pose, outline.camera) for outline in posed]
-        shape = mesh_of_profile(carve(posed, poses, _axis_range(posed, poses)))
+        shape = mesh_profile(carve(posed, poses, _axis_range(posed, poses)))
         return msgspec.structs.replace(shape, overlap=overlap(shape, posed))
     starts = [(outline, bodies) for outline in outlines[:REFERENCES] if (bodies := _plausible_bodies(outline))]
     if not starts:
@@ -125,7 +125,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
             outlines[0].photo,
         )
         best = max(starts[0][1], key=lambda body: abs(body.tilt_deg))
-        return msgspec.structs.replace(mesh_of_profile(best.profile).of_size(1.0), overlap=best.overlap)
+        return msgspec.structs.replace(mesh_profile(best.profile).with_size(1.0), overlap=best.overlap)
     poses = _choose_tilt(starts, outlines[:JUDGES], report)
     profile = poses[0].profile
     poses += [fit_pose(outline, profile) for outline in outlines[JUDGES:]]
@@ -134,10 +134,10 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
         profile = carve(outlines, poses, (profile[0, 0], profile[-1, 0]))
         poses = [fit_pose(outline, profile, pose) for outline, pose in zip(outlines, poses, strict=True)]
     mean_overlap = float(np.mean([pose.overlap for pose in poses]))
-    return msgspec.structs.replace(mesh_of_profile(profile).of_size(1.0), overlap=mean_overlap)
+    return msgspec.structs.replace(mesh_profile(profile).with_size(1.0), overlap=mean_overlap)
 
 
-def _without_holes(outline: Outline) -> Outline:
+def _fill_holes(outline: Outline) -> Outline:
     """Fill holes of the outline, such as a highlight that a mask lacks; no body of revolution has holes."""
     filled = np.where(binary_fill_holes(outline.part) & (outline.part == 0), 1, outline.part)
     return msgspec.structs.replace(outline, part=filled)
@@ -167,10 +167,10 @@ def _choose_tilt(
     A warning is logged if a wide range of tilts explains the outlines alike. `starts` holds outlines and bodies of
     different tilts that explain each.
     """
-    bodies = [(outline, body) for outline, of_outline in starts for body in of_outline]
+    bodies = [(outline, body) for outline, candidates in starts for body in candidates]
     trials = []
-    for done, (outline, body) in enumerate(bodies):
-        report(0.7 * done / len(bodies))
+    for index, (outline, body) in enumerate(bodies):
+        report(0.7 * index / len(bodies))
         poses = [body if judge is outline else fit_pose(judge, body.profile) for judge in judges]
         trials.append(TiltTrial(outline, body, poses))
     best = max(trials, key=lambda trial: trial.overlap)
@@ -183,18 +183,18 @@ def _choose_tilt(
             poses = [finer if judge is best.outline else fit_pose(judge, finer.profile, start) for judge, start in near]
             trials.append(TiltTrial(best.outline, finer, poses))
     best = max(trials, key=lambda trial: trial.overlap)
-    alike = [
+    similar = [
         trial.body.tilt_deg
         for trial in trials
         if trial.outline is best.outline and trial.overlap >= best.overlap - AS_GOOD
     ]
-    if max(alike) - min(alike) > UNTOLD_DEG:
+    if max(similar) - min(similar) > UNTOLD_DEG:
         log.warning(
             "%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is uncertain: add a "
             "photo from higher up or from lower down",
             best.outline.photo,
-            min(alike),
-            max(alike),
+            min(similar),
+            max(similar),
         )
     return best.poses
 
@@ -212,7 +212,7 @@ def _body_at_tilt(
     if len(profile) < 3:
         return None
     posed = msgspec.structs.replace(outline, pose=pose)
-    return msgspec.structs.replace(body, profile=profile, overlap=overlap(mesh_of_profile(profile), [posed]))
+    return msgspec.structs.replace(body, profile=profile, overlap=overlap(mesh_profile(profile), [posed]))
 
 
 def mirror_planes(outline: Outline) -> list[Float[np.ndarray, "3"]]:
@@ -342,7 +342,7 @@ def largest_discs(outline: Outline, body: BodyView, heights: Float[np.ndarray, "
     return np.where(first == 0, 0.0, low)
 
 
-def mesh_of_profile(profile: Profile) -> Triangles:
+def mesh_profile(profile: Profile) -> Triangles:
     """Mesh the body of a profile, closed by a disc at each end.
 
     Raises:
@@ -372,7 +372,7 @@ def fit_pose(outline: Outline, profile: Profile, near: BodyView | None = None) -
     Returns:
         The body with its pose, camera and overlap.
     """
-    caster = Caster(mesh_of_profile(profile).as_mesh())
+    caster = Caster(mesh_profile(profile).as_mesh())
     if near is None:
         estimate = estimate_pose(caster, outline.view, SEARCH)
     else:

@@ -171,7 +171,7 @@ def _extract_features(
         key = photo.grey.shape, photo.camera.centre, photo.camera.focal, photo.focal_sigma
         groups.setdefault(key, []).append(f"{name}.png")
     known_focals = set()
-    done = count()
+    counter = count()
     for number, (((height, width), centre, focal, sigma), files) in enumerate(groups.items(), start=1):
         reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", mask_path=str(root / "masks"))
         if sigma < TYPICAL_SIGMA or centre != (width / 2, height / 2):
@@ -179,7 +179,7 @@ def _extract_features(
         if sigma == 0:
             known_focals.add(number)
         for file in files:
-            report(0.2 * next(done) / len(photos), "features")
+            report(0.2 * next(counter) / len(photos), "features")
             pycolmap.extract_features(
                 root / DATABASE,
                 root / "images",
@@ -219,11 +219,11 @@ def _reconstruct(
     Returns:
         The model.
     """
-    done = count(2)  # the first two photos are registered together
+    counter = count(2)  # the first two photos are registered together
 
     def report_photo() -> None:
         """Report that one more photo is registered."""
-        report(0.6 + 0.3 * min(next(done) / images, 1.0), "cameras")
+        report(0.6 + 0.3 * min(next(counter) / images, 1.0), "cameras")
 
     report(0.6, "cameras")
     options = pycolmap.IncrementalPipelineOptions(

@@ -91,14 +91,14 @@ class Triangles(msgspec.Struct, frozen=True):
         label = np.ones(len(self.faces), np.int16)
         return Mesh(self.vertices, self.faces.astype(np.int32), np.ones_like(self.vertices), label)
 
-    def of_size(self, size: float) -> "Triangles":
+    def with_size(self, size: float) -> "Triangles":
         """Centre the bounding box at the origin and scale its longest side to `size`."""
         low = self.vertices.min(axis=0)
         high = self.vertices.max(axis=0)
         return msgspec.structs.replace(self, vertices=(self.vertices - (low + high) / 2) * (size / (high - low).max()))
 
 
-def write_obj(path: Path, shape: Triangles, parts: list[str]) -> None:
+def write_triangles(path: Path, shape: Triangles, parts: list[str]) -> None:
     """Write an OBJ file with a group for each part that has faces.
 
     Args:

@@ -23,7 +23,7 @@ from factorlib.align.refine import DAMPING, PoseState, normal_equations, render
 from factorlib.align.search import SearchOptions, estimate_pose
 from factorlib.align.silhouette import Target, make_target
 from factorlib.geometry.raster import Caster
-from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.shapes.outline import Outline, Triangles
 
 # initial factors of the axes
@@ -61,15 +61,15 @@ def primitive(
     targets = [make_target(outline.view, (1,), RESOLUTION) for outline in outlines]
     starts = STARTS.get(kind, ((1, 1, 1),))
     best: tuple[float, Float[np.ndarray, "3"]] = -1.0, np.ones(3)
-    for done, start in enumerate(starts):
-        report(done / len(starts))
+    for index, start in enumerate(starts):
+        report(index / len(starts))
         mesh = unit_shape(kind, np.array(start, float)).as_mesh()
         caster = Caster(mesh)
         states = [estimate_pose(caster, outline.view, SEARCH).state for outline in outlines]
         factors, score = fit_proportions(mesh, targets, states, STEPS, FREE_FACTORS.get(kind, np.zeros((3, 0))))
         if score > best[0]:
             best = score, factors * start
-    return msgspec.structs.replace(unit_shape(kind, best[1]).of_size(1.0), overlap=best[0])
+    return msgspec.structs.replace(unit_shape(kind, best[1]).with_size(1.0), overlap=best[0])
 
 
 def unit_shape(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
@@ -104,7 +104,7 @@ def fit_proportions(
     jacobian = partial(jacobian_with_shape, free=free)
     for k in range(steps + 1):
         factors = np.exp(free @ shape)
-        caster = Caster(scaled(mesh, tuple(factors)))
+        caster = Caster(scale_mesh(mesh, tuple(factors)))
         renderings = [render(caster, target, state) for target, state in zip(targets, states, strict=True)]
         if (score := float(np.mean([rendering.score for rendering in renderings]))) > best[1]:
             best = factors, score
@@ -113,7 +113,7 @@ def fit_proportions(
         equations = [normal_equations(rendering, jacobian) for rendering in renderings]
         by_shape, moves = _joint_step(equations, [target.view.free for target in targets])
         shape = shape + by_shape
-        states = [state.moved(move) for state, move in zip(states, moves, strict=True)]
+        states = [state.apply_step(move) for state, move in zip(states, moves, strict=True)]
         if np.abs(by_shape).max(initial=0.0) < STILL:
             break
     return best

@@ -31,7 +31,7 @@ from scipy.ndimage import distance_transform_edt
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import lattice_of_lobes, sample_map
-from factorlib.light.lobes import Lobes, lobe_integral
+from factorlib.light.lobes import Lobes, lobe_energy
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.materials import Reflectance
@@ -118,7 +118,11 @@ def shape(
 
 
 def sensor(
-    camera: Camera, world_from_camera: Matrix, columns: slice = slice(None), near: float = 1e-3, alpha: bool = False
+    camera: Camera,
+    world_from_camera: Matrix,
+    columns: slice = slice(None),
+    near_clip: float = 1e-3,
+    alpha: bool = False,
 ) -> dict[str, Any]:
     """Return the pinhole camera as a Mitsuba sensor, restricted to some columns of its image.
 
@@ -126,7 +130,7 @@ def sensor(
         camera: Camera.
         world_from_camera: Transform of the camera.
         columns: Columns to render.
-        near: Distance of the near clipping plane; the far one is at 10⁷ times that.
+        near_clip: Distance of the near clipping plane; the far one is at 10⁷ times that.
         alpha: Add a fourth channel, the coverage of each pixel.
 
     Returns:
@@ -144,8 +148,8 @@ def sensor(
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal))),
-        "near_clip": near,
-        "far_clip": 1e7 * near,
+        "near_clip": near_clip,
+        "far_clip": 1e7 * near_clip,
         **{f"principal_point_offset_{axis}": value for axis, value in offset.items() if value},
         "to_world": transform(world_from_camera @ MITSUBA_FROM_CAMERA),
         "sampler": {"type": SAMPLER},
@@ -165,7 +169,7 @@ class Channels(msgspec.Struct, frozen=True):
     guides: bool = False
 
 
-def rendered(
+def render_scene(
     entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, channels: Channels = Channels()
 ) -> Image:
     """Render the radiance of a scene in the picture of a `sensor`.
@@ -239,8 +243,8 @@ def incident_light(
     camera = Camera(size, size, size / 2, (size / 2, size / 2))
     faces = {}
     for number, (name, (pitch, yaw)) in enumerate(FACE_LOOKS.items()):
-        world_from_camera = rigid(world_from_light[:3, :3] @ look(pitch, yaw), world_from_light[:3, 3])
-        faces[name] = rendered(entries, sensor(camera, world_from_camera), spp, 6 * seed + number, max_depth)
+        world_from_camera = rigid(world_from_light[:3, :3] @ look_rotation(pitch, yaw), world_from_light[:3, 3])
+        faces[name] = render_scene(entries, sensor(camera, world_from_camera), spp, 6 * seed + number, max_depth)
     fine = 8 * height, 16 * height
     directions = lat_long_directions(*fine)
     weight = lat_long_solid_angles(*fine)[:, None, None]
@@ -251,7 +255,7 @@ def incident_light(
     return weighted / total
 
 
-def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
+def look_rotation(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
     """Return world_from_camera of a camera that looks along +z, rotated toward +x by yaw, then upward by pitch."""
     pitch, yaw = np.radians([pitch_deg, yaw_deg])
     forward = np.array([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)])
@@ -267,17 +271,17 @@ def cube_map_lookup(faces: dict[str, np.ndarray], directions: Float[np.ndarray, 
         axis = "xyz".index(name[1])
         sign = 1 if name[0] == "+" else -1
         hit = (largest == axis) & (sign * directions[..., axis] > 0)
-        x, y, z = np.moveaxis(directions[hit] @ look(pitch, yaw), -1, 0)
+        x, y, z = np.moveaxis(directions[hit] @ look_rotation(pitch, yaw), -1, 0)
         size = len(faces[name])
         column, row = ((np.stack([x, y]) / z + 1) / 2 * size).astype(int).clip(0, size - 1)
         values[hit] = faces[name][row, column]
     return values
 
 
-def denoised(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]:
+def denoise_picture(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]:
     """Denoise linear radiance times coverage; coverage is left unchanged.
 
-    `picture` holds radiance, coverage, and the guides of `factorlib.tracing.scene.rendered`, all times coverage.
+    `picture` holds radiance, coverage, and the guides of `factorlib.tracing.scene.render_scene`, all times coverage.
     """
     os.environ["OIDN_DEFAULT_DEVICE"] = "cpu"  # the same bytes with and without a GPU
     mitsuba()  # the denoiser uses its thread pool
@@ -301,14 +305,14 @@ def denoiser() -> str:
 NARROWEST = 0.5  # least variance, in h², of a lobe at the nodes: a narrower one would fall between them
 
 
-def sharpened(lobes: Lobes, spacing: float) -> Lobes:
+def sharpen_lobes(lobes: Lobes, spacing: float) -> Lobes:
     """Return narrower lobes that linear interpolation between nodes widens back to `lobes`; energy is kept.
 
     `spacing` is the distance of the nodes in radians.
     """
     # variance 1/λ − h²/6, at the same energy
     variance = np.maximum(1 / lobes.sharpness - spacing**2 / 6, NARROWEST * spacing**2)
-    factor = np.asarray(lobe_integral(lobes.sharpness) / lobe_integral(1 / variance))
+    factor = np.asarray(lobe_energy(lobes.sharpness) / lobe_energy(1 / variance))
     return Lobes(lobes.axis, 1 / variance, lobes.weight * factor[:, None])
 
 
@@ -323,7 +327,7 @@ def mitsuba_map(lobes: Lobes, height: int, width: int) -> Float[np.ndarray, "h w
     Returns:
         Radiance at the nodes, in the lobes' frame turned y-up.
     """
-    narrowed = sharpened(lobes, np.pi / (height - 1))
+    narrowed = sharpen_lobes(lobes, np.pi / (height - 1))
     theta = np.arange(height)[:, None] / (height - 1) * np.pi
     phi = (np.arange(width)[:, None] + 0.5) / width * 2 * np.pi
     return lattice_of_lobes(narrowed, height, width, lambda _: (theta, phi, np.ones(1)))

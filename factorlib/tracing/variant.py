@@ -43,8 +43,8 @@ def mitsuba(variant: str | None = None) -> ModuleType:
 
 def _fastest() -> str:
     """Return the fastest variant that runs here, and set the path of its LLVM library."""
-    found = {path.resolve() for folder in FOLDERS for path in Path("/").glob(f"{folder[1:]}/libLLVM*.so*")}
-    newest_first = [str(path) for path in sorted(found, key=_version, reverse=True) if _version(path) >= 16]
+    libraries = {path.resolve() for folder in FOLDERS for path in Path("/").glob(f"{folder[1:]}/libLLVM*.so*")}
+    newest_first = [str(path) for path in sorted(libraries, key=_version, reverse=True) if _version(path) >= 16]
     for library in [os.environ.get(LIBRARY), *newest_first]:
         if library and _runs(library):
             os.environ[LIBRARY] = library

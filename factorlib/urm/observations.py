@@ -80,7 +80,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: the direction is visible; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = None  # codes of `geometry.occluder_codes`; needs `visibility`
+    occluder: UInt16[np.ndarray, "n k"] | None = None  # codes of `geometry.occluder_codes`; needs `visibility`
     exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
@@ -90,15 +90,15 @@ class Observations(msgspec.Struct, frozen=True):
         return len(self.weight)
 
     @property
-    def half(self) -> Float[np.ndarray, "n 3"]:
+    def half_vector(self) -> Float[np.ndarray, "n 3"]:
         """Half vector of the paper, (2(n·o)n − o + (0, 0, −1)) / 2, camera frame, from normals and views as float32."""
         return half_of_normal_and_view(self.normal.astype("f4").astype("f8"), self.view.astype("f4").astype("f8"))
 
     def take(self, rows: np.ndarray) -> Observations:
         """Select the observations of `rows` (indices or a mask), with the same names."""
         columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL, "detail")}
-        taken = {name: values[rows] for name, values in columns.items() if values is not None}
-        return msgspec.structs.replace(self, **taken)
+        selected = {name: values[rows] for name, values in columns.items() if values is not None}
+        return msgspec.structs.replace(self, **selected)
 
 
 # types of the required columns
@@ -122,10 +122,10 @@ NAMES = {
     "photos": "photo",
     "illuminations": "illumination",
 }
-# optional columns of K values a row: type, value if everything is visible, meaning
-WIDE: dict[str, tuple[np.dtype, int, str]] = {
-    "visibility": (np.dtype("u1"), 255, VISIBILITY),
-    "met": (np.dtype("<u2"), NO_OCCLUDER, MET),
+# optional columns of K values a row, by attribute: column, type, value if everything is visible, meaning
+WIDE: dict[str, tuple[str, np.dtype, int, str]] = {
+    "visibility": ("visibility", np.dtype("u1"), 255, VISIBILITY),
+    "occluder": ("met", np.dtype("<u2"), NO_OCCLUDER, MET),
 }
 
 
@@ -133,15 +133,15 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     """Write the fixed Parquet columns, and `confidence`, `place`, `visibility` and `met` if they are present."""
     columns = {}
     for name, dtype in {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}.items():
-        if (values := getattr(observations, name)) is not None:
+        if (values := getattr(observations, "half_vector" if name == "half" else name)) is not None:
             values = np.ascontiguousarray(values, dtype=dtype)
             flat = pa.array(values.reshape(-1))
             columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
     about = {**UNITS, **{kind: getattr(observations, kind) for kind in NAMES}}
     if any(exposure is not None for exposure in observations.exposures):
         about["exposures"] = observations.exposures
-    for name, (wide, _, meaning) in WIDE.items():
-        if (values := getattr(observations, name)) is not None:
+    for attribute, (name, wide, _, meaning) in WIDE.items():
+        if (values := getattr(observations, attribute)) is not None:
             data = pa.py_buffer(np.ascontiguousarray(values, dtype=wide))
             type_ = pa.binary(values.shape[1] * wide.itemsize)  # the values of a row as one binary of fixed size
             columns[name] = pa.FixedSizeBinaryArray.from_buffers(type_, len(values), [None, data])
@@ -157,11 +157,12 @@ def read_observations(path: str | Path) -> Observations:
     Raises:
         InputError: If it is any other Parquet file.
     """
-    parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
+    parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *(name for name, *_ in WIDE.values())), CURE)
     with reading(WHAT, path, cure=CURE):
         narrow = {name: dtype for name, dtype in (COLUMNS | OPTIONAL).items() if name in parts}
         fields: dict[str, Any] = {name: _array(parts[name], dtype, name in VECTORS) for name, dtype in narrow.items()}
-        fields |= {name: _rows_of_bytes(parts[name], wide) for name, (wide, *_) in WIDE.items() if name in parts}
+        wide = {attribute: (parts[name], dtype) for attribute, (name, dtype, *_) in WIDE.items() if name in parts}
+        fields |= {attribute: _rows_of_bytes(*column) for attribute, column in wide.items()}
         fields |= {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in NAMES}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
         observations = Observations(**fields, exposures=exposures)
@@ -186,10 +187,10 @@ def _check(observations: Observations) -> None:
         raise ValueError("column 'confidence' has a value outside 0 to 1")
     if observations.place is not None and not np.isfinite(observations.place).all():
         raise ValueError("column 'place' has a value that is not finite")
-    if observations.met is not None:
-        if observations.visibility is None or observations.visibility.shape != observations.met.shape:
+    if observations.occluder is not None:
+        if observations.visibility is None or observations.visibility.shape != observations.occluder.shape:
             raise ValueError("column 'met' does not have one code per direction of 'visibility'")
-        known = observations.met[observations.met != NO_OCCLUDER]
+        known = observations.occluder[observations.occluder != NO_OCCLUDER]
         if len(known) and known.max() >= BINS * len(observations.materials):
             raise ValueError("column 'met' has the code of a material without a name in the metadata")
 
@@ -216,12 +217,12 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         renumbered = [new[index] if len(new) else index for new, index in zip(numbers, indices, strict=True)]
         fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
-    fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()}
+    fills = {name: (dtype, nothing) for name, (_, dtype, nothing, _) in WIDE.items()}
     fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0), "detail": (np.dtype("f4"), 1)}
     # optional columns: parts without them get full visibility, full confidence, and the origin as place
     for name, (dtype, fill) in fills.items():
-        given = [getattr(part, name) for part in parts]
-        shapes = {values.shape[1:] for values in given if values is not None}
+        columns = [getattr(part, name) for part in parts]
+        shapes = {values.shape[1:] for values in columns if values is not None}
         if len(shapes) > 1:
             counts = sorted(count for (count,) in shapes)
             fault = f"the photos have different numbers of directions in {name!r}: {counts[0]} and {counts[1]}"
@@ -229,7 +230,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         for shape in shapes:
             filled = [
                 np.full((len(part), *shape), fill, dtype) if values is None else values
-                for part, values in zip(parts, given)
+                for part, values in zip(parts, columns)
             ]
             fields[name] = np.concatenate(filled)
     fields["exposures"] = tuple(exposures.get(photo) for photo in fields["photos"])

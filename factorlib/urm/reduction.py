@@ -33,7 +33,7 @@ CELL = np.radians(3.0)  # cell of normals, about the accuracy of poses and meshe
 def merge(observations: Observations, degrees: float) -> Observations:
     """Merge within cells of about `degrees`; 0 merges nothing. The total weight is preserved.
 
-    `x`, `y` and `met` become those of the group's first pixel.
+    `x`, `y` and `occluder` become those of the group's first pixel.
     """
     if degrees <= 0 or len(observations) == 0:
         return observations

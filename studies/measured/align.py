@@ -61,20 +61,20 @@ def posed_photo(kind: str, shape: str, seed: int, number: int) -> PosedPhoto:
     """Return the photo of that kind; the same one for the same arguments."""
     rng = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode()))
     fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
-    camera, pose, label = photograph(bodies.mesh(shape), rng, fill)
-    truth = rasterise(bodies.mesh(shape), camera, pose)
-    mesh = bodies.rough(shape, seed) if kind == "rough" else bodies.mesh(shape)
+    camera, pose, label = random_photograph(bodies.photographed_mesh(shape), rng, fill)
+    truth = rasterise(bodies.photographed_mesh(shape), camera, pose)
+    mesh = bodies.rough_mesh(shape, seed) if kind == "rough" else bodies.photographed_mesh(shape)
     if kind == "mirrored mask":
         label = label[:, ::-1]
     if kind == "wrong mask":
         label = _blot(label, mesh.labels, rng)
     if kind == "wrong mesh":
-        mesh = bodies.mesh(str(rng.choice([other for other in SHAPES if other != shape])))
+        mesh = bodies.photographed_mesh(str(rng.choice([other for other in SHAPES if other != shape])))
         label = np.minimum(label, max(mesh.labels))
     return PosedPhoto(camera, pose, np.ascontiguousarray(label), mesh, truth)
 
 
-def photograph(mesh: Mesh, rng: np.random.Generator, fill: float) -> tuple[Camera, Pose, Int[np.ndarray, "h w"]]:
+def random_photograph(mesh: Mesh, rng: np.random.Generator, fill: float) -> tuple[Camera, Pose, Int[np.ndarray, "h w"]]:
     """Return a camera, a pose that the frame does not cut, and the labels of the visible object."""
     focal = WIDTH * float(np.exp(rng.uniform(*np.log(FOCALS))))
     camera = Camera(WIDTH, HEIGHT, focal, (WIDTH / 2, HEIGHT / 2))
@@ -113,7 +113,7 @@ def measure(key: Key) -> dict:
     photo = posed_photo(*key)
     caster = Caster(photo.mesh)
     start_s = (time.process_time(), time.perf_counter())
-    silhouette = silhouette_of_object({"label": photo.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
+    silhouette = silhouette_of_object({"label": photo.label.astype(float)}, 1, caster.mesh.labels, has_mask=False)
     obj = ObjectToAlign("object", caster, silhouette)
     result = align_photo([obj], Camera(WIDTH, HEIGHT, 1.0, photo.camera.centre), KnownFocal(), " ".join(map(str, key)))
     maps = rasterise(caster, result.camera, result.poses[0])

@@ -75,7 +75,7 @@ def unlinked(folder: Path, spec: Spec, rng: Rng) -> None:
     spec["materials"].append("wood_2")
     photo = spec["photos"][1]
     photo["objects"][0]["materials"]["legs"] = "wood_2"
-    relabelled(folder, photo, {spec["materials"].index("wood") + 1: len(spec["materials"])})
+    relabel(folder, photo, {spec["materials"].index("wood") + 1: len(spec["materials"])})
 
 
 def miscalled(folder: Path, spec: Spec, rng: Rng) -> None:
@@ -87,17 +87,17 @@ def miscalled(folder: Path, spec: Spec, rng: Rng) -> None:
     shells = [photo["objects"][0]["materials"]["shell"] for photo in pair]
     for photo, old, new in zip(pair, shells, shells[::-1], strict=True):
         photo["objects"][0]["materials"]["shell"] = new
-        relabelled(folder, photo, {spec["materials"].index(old) + 1: spec["materials"].index(new) + 1})
+        relabel(folder, photo, {spec["materials"].index(old) + 1: spec["materials"].index(new) + 1})
 
 
 def clipped(folder: Path, spec: Spec, rng: Rng) -> None:
     """Expose all photos two to three stops more."""
-    exposed(folder, spec, 2 ** rng.uniform(2, 3))
+    expose(folder, spec, 2 ** rng.uniform(2, 3))
 
 
 def dark(folder: Path, spec: Spec, rng: Rng) -> None:
     """Expose all photos four to six stops less: few codes are left."""
-    exposed(folder, spec, 2 ** -rng.uniform(4, 6))
+    expose(folder, spec, 2 ** -rng.uniform(4, 6))
 
 
 def noisy(folder: Path, spec: Spec, rng: Rng) -> None:
@@ -121,10 +121,10 @@ def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
     for photo in spec["photos"]:
         image = folder / photo["image"]
         masks = [photo["masks"], *(obj["mask"] for obj in photo["objects"] if "mask" in obj)]
-        small, focal = shrunk(image, Image.Resampling.BOX)
+        small, focal = shrink(image, Image.Resampling.BOX)
         write_photo(image, srgb_decode(small / 255.0), focal)
         for file in masks:
-            write_labels(folder / file, shrunk(folder / file, Image.Resampling.NEAREST)[0])
+            write_labels(folder / file, shrink(folder / file, Image.Resampling.NEAREST)[0])
         file = folder / f"truth/{photo['name']}_normal.exr"
         channels = read_exr(file)
         write_normals(file, np.stack([channels[f"normal.{axis}"][3::6, 3::6] for axis in "xyz"], axis=-1))
@@ -132,7 +132,7 @@ def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
             photo["camera"] = {"focal_px": photo["camera"]["focal_px"] / 6}
 
 
-def shrunk(file: Path, resampling: Image.Resampling) -> tuple[np.ndarray, int | None]:
+def shrink(file: Path, resampling: Image.Resampling) -> tuple[np.ndarray, int | None]:
     """Return a picture six times smaller, and its focal length."""
     with Image.open(file) as picture:
         return np.asarray(picture.resize((picture.width // 6, picture.height // 6), resampling)), focal_of(picture)
@@ -188,7 +188,7 @@ def truth_of(spec: Spec, truth: Spec) -> Spec:
     return {"materials": materials, **by_photo}
 
 
-def relabelled(folder: Path, photo: Spec, new: dict[int, int]) -> None:
+def relabel(folder: Path, photo: Spec, new: dict[int, int]) -> None:
     """Change labels in the photo's mask."""
     with Image.open(folder / photo["masks"]) as picture:
         labels = np.asarray(picture)
@@ -197,7 +197,7 @@ def relabelled(folder: Path, photo: Spec, new: dict[int, int]) -> None:
     write_labels(folder / photo["masks"], table[labels])
 
 
-def exposed(folder: Path, spec: Spec, factor: float) -> None:
+def expose(folder: Path, spec: Spec, factor: float) -> None:
     """Expose all photos by a factor more; true lights are in the units of their photos."""
     each_photo(folder, spec, lambda linear: linear * factor)
     for photo in spec["photos"]:

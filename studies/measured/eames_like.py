@@ -127,8 +127,8 @@ def split_maps(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]
     if len(maps) < MAPS + 2:
         cure = f"{MAPS} light a set and the prior needs two more: name folders with {MAPS + 2}"
         raise InputError(f"{len(maps)} maps", key="LIGHTS", cure=cure)
-    chosen = set(np.random.default_rng(seed).permutation(len(maps))[:MAPS].tolist())
-    return [m for k, m in enumerate(maps) if k in chosen], [m for k, m in enumerate(maps) if k not in chosen]
+    held_out = set(np.random.default_rng(seed).permutation(len(maps))[:MAPS].tolist())
+    return [m for k, m in enumerate(maps) if k in held_out], [m for k, m in enumerate(maps) if k not in held_out]
 
 
 def link_maps(maps: Sequence[Path], folder: Path) -> Path:

@@ -65,7 +65,7 @@ def prior_of(paths: Sequence[Path], scored: bool = True) -> LightPrior:
     logs = log_cells(np.stack([cell_means(read_light_map(path), cells) for path in tqdm(paths, desc="reading")]))
     sources = tuple(SourceMap(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
     scores = leave_one_out(logs, cells) if scored and len(paths) > 1 else None
-    return rounded(msgspec.structs.replace(fitted(logs, cells), made_from=sources, leave_one_out=scores))
+    return round_numbers(msgspec.structs.replace(fit_prior(logs, cells), made_from=sources, leave_one_out=scores))
 
 
 def cell_means(lat_long: Float[np.ndarray, "h w 3"], cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -99,7 +99,7 @@ def mean_of(prior: LightPrior, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndar
     return np.array(prior.profile) @ legendre(cells @ UP).T
 
 
-def fitted(
+def fit_prior(
     logs: Logs, cells: Float[np.ndarray, "n 3"], profile: bool = True, start: LightPrior | None = None
 ) -> LightPrior:
     """Fit the prior of greatest likelihood to `logs`, y of some maps.
@@ -138,9 +138,9 @@ def _cost(
 ) -> tuple[float, Float[np.ndarray, "5"], Float[np.ndarray, " q"]]:
     """Return −log L per map, its gradient by t, and β: equations (1) to (3)."""
     variance, decay, nugget, level, freedom = np.exp(t)
-    alike = variance * correlation(angle, decay)
+    covariance = variance * correlation(angle, decay)
     count = len(angle)
-    factor = cho_factor(alike + level + nugget * np.eye(count), lower=True)
+    factor = cho_factor(covariance + level + nugget * np.eye(count), lower=True)
     inverse = cho_solve(factor, np.eye(count))
     beta, weight = _weighted_means(inverse, design, values, freedom)
     residual = values - design @ beta
@@ -149,7 +149,7 @@ def _cost(
     slope = 0.5 * (inverse - (weight[:, None] * solved).T @ solved / len(values))
     by_freedom = np.log1p(square / freedom) - weight * square / freedom  # ν
     by_freedom = by_freedom - digamma((freedom + count) / 2) + digamma(freedom / 2) + count / freedom
-    gradient = [np.sum(slope * alike), np.sum(slope * alike * angle) / decay, nugget * np.trace(slope)]
+    gradient = [np.sum(slope * covariance), np.sum(slope * covariance * angle) / decay, nugget * np.trace(slope)]
     gradient += [level * slope.sum(), freedom * by_freedom.mean() / 2]
     return -_log_density(factor[0], square, freedom).mean(), np.array(gradient), beta
 
@@ -204,19 +204,19 @@ def white_noise(prior: LightPrior) -> LightPrior:
 
 def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"]) -> LeaveOneOut:
     """Score each map under a prior fitted to the others, and under two nulls fitted to them; return the means."""
-    whole = fitted(logs, cells)
-    flat = fitted(logs, cells, profile=False)
+    whole = fit_prior(logs, cells)
+    flat = fit_prior(logs, cells, profile=False)
     scores = []
     for m in tqdm(range(logs.shape[1]), desc="leaving one out"):
-        rest = np.delete(logs, m, axis=1)
-        one = logs[:, m : m + 1]
-        prior = fitted(rest, cells, start=whole)
-        priors = prior, white_noise(prior), fitted(rest, cells, profile=False, start=flat)
-        scores.append([float(log_likelihood(each, one, cells)[0]) for each in priors])
+        training = np.delete(logs, m, axis=1)
+        held_out = logs[:, m : m + 1]
+        prior = fit_prior(training, cells, start=whole)
+        priors = prior, white_noise(prior), fit_prior(training, cells, profile=False, start=flat)
+        scores.append([float(log_likelihood(each, held_out, cells)[0]) for each in priors])
     return LeaveOneOut(*np.mean(scores, axis=0).tolist())
 
 
-def rounded(prior: LightPrior) -> LightPrior:
+def round_numbers(prior: LightPrior) -> LightPrior:
     """Round to the digits that a table needs."""
 
     def short(value: float | tuple) -> float | tuple:

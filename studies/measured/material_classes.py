@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from factorlib.errors import InputError
-from factorlib.inference.priors import Classes, MaterialClass
+from factorlib.inference.material_prior import Classes, MaterialClass
 from factorlib.jsonfile import json_text, write_json
 from factorlib.reading import read_bytes, reading
 
@@ -57,11 +57,11 @@ def classes_of(path: Path) -> Classes:
     if few := [name for name, values in by_class.items() if len(values) < 4]:
         cure = "name the materials by what they are"
         raise InputError(f"only few rows are of the class {few[0]}", file=path, cure=cure)
-    classes = tuple(_fitted(name, np.array(values), len(rows)) for name, values in by_class.items())
+    classes = tuple(_fit_class(name, np.array(values), len(rows)) for name, values in by_class.items())
     return Classes(classes, made_from=path.name, sha256=hashlib.sha256(content).hexdigest())
 
 
-def _fitted(name: str, values: np.ndarray, total: int) -> MaterialClass:
+def _fit_class(name: str, values: np.ndarray, total: int) -> MaterialClass:
     log = np.log(np.maximum(values[:, :3], LEAST))
     tint = np.median(np.linalg.norm(log - log.mean(1, keepdims=True), axis=1)) / RAYLEIGH
     x = np.column_stack([np.log(np.maximum(values[:, 3], LEAST)), values[:, 4]])

@@ -24,8 +24,8 @@ def write() -> Path:
         raise InputError("what runs notebooks is not installed", cure="make setup EXTRAS=notebook") from error
     evaluate_dataset("eames", ROOT)
     notebook = nbformat.read(PAGE, 4)
-    where = {"metadata": {"path": str(PAGE.parent)}}
-    NotebookClient(notebook, kernel_name="python3", record_timing=False, timeout=None, resources=where).execute()
+    resources = {"metadata": {"path": str(PAGE.parent)}}
+    NotebookClient(notebook, kernel_name="python3", record_timing=False, timeout=None, resources=resources).execute()
     notebook.metadata.language_info = {"name": "python"}
     write_text(PAGE, nbformat.writes(notebook) + "\n")
     return PAGE

@@ -79,7 +79,7 @@ def specular_errors(operator: Operator, samples: Samples) -> dict:
     with torch.no_grad():
         value = operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
     error = (value - samples.value) / samples.scale()
-    return _of_finite(lambda some: specular_table(error[some], *(t[some] for t in samples.inputs())), value)
+    return _finite_only(lambda rows: specular_table(error[rows], *(t[rows] for t in samples.inputs())), value)
 
 
 def diffuse_errors(operator: Operator, samples: DiffuseSamples) -> dict:
@@ -88,13 +88,13 @@ def diffuse_errors(operator: Operator, samples: DiffuseSamples) -> dict:
     with torch.no_grad():
         value = operator.diffuse(sharpness, nz)[:, 0].double()
     error = (value - samples.value) / samples.scale()
-    return _of_finite(lambda some: diffuse_table(error[some], samples.sharpness[some], samples.nz[some]), value)
+    return _finite_only(lambda rows: diffuse_table(error[rows], samples.sharpness[rows], samples.nz[rows]), value)
 
 
-def _of_finite(table: Callable[[Tensor], dict], value: Tensor) -> dict:
+def _finite_only(table: Callable[[Tensor], dict], value: Tensor) -> dict:
     """Return the table of the samples whose value is finite, and how many are not, if any."""
-    some = value.isfinite()
-    return (table(some) if some.any() else {}) | ({} if some.all() else {"not finite": int((~some).sum())})
+    finite = value.isfinite()
+    return (table(finite) if finite.any() else {}) | ({} if finite.all() else {"not finite": int((~finite).sum())})
 
 
 def gradient_errors(operator: Operator, true: list[Tensor]) -> dict:
@@ -102,7 +102,7 @@ def gradient_errors(operator: Operator, true: list[Tensor]) -> dict:
     scale = true[0] + lobe_integral(specular_inputs(GRADIENTS, 5)[1]) / 100
     pairs = zip(SLOPES, gradients(operator)[1:], true[1:], strict=True)
     errors = {name: (a - b) / (b.abs() + scale) for name, a, b in pairs}
-    return {name: _of_finite(lambda some, e=e: quantiles(e[some]), e) for name, e in errors.items()}
+    return {name: _finite_only(lambda rows, e=e: quantiles(e[rows]), e) for name, e in errors.items()}
 
 
 def gradients(operator: Operator) -> list[Tensor]:
@@ -190,7 +190,7 @@ def rows() -> Tables:
 
 def _percents(title: str, errors: dict[str, dict]) -> list[list[str]]:
     cells = {
-        name: [f"{format_number(100 * of_name[q])} %" if q in of_name else "–" for q in QUANTILES]
-        for name, of_name in errors.items()
+        name: [f"{format_number(100 * row[q])} %" if q in row else "–" for q in QUANTILES]
+        for name, row in errors.items()
     }
     return [[title, *QUANTILES], *([name, *values] for name, values in cells.items())]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from factorlib.conventions import FRONT, half_of_normal_and_view
-from factorlib.generate.lobe_spheres import random_spheres, rendered
+from factorlib.generate.lobe_spheres import random_spheres, render_spheres
 from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED, write_layers
@@ -30,7 +30,7 @@ def main() -> None:
     torch.set_num_threads(1)  # sums depend on it
     rng = np.random.default_rng(0)
     light = random_spheres(rng, SPHERES)
-    pixels = rendered(light, PIXELS, rng)
+    pixels = render_spheres(light, PIXELS, rng)
     each = (light.axis[:, None], light.sharpness[:, None], light.roughness[:, None])
     vectors = (pixels.normal, half_of_normal_and_view(pixels.normal, FRONT), *each)
     shape = pixels.normal.shape[:2]
@@ -42,9 +42,9 @@ def main() -> None:
         "diffuse": diffuse_inputs(normal, axis, sharpness),
         "specular": specular_inputs(normal, half, axis, sharpness, roughness),
     }
-    for part, of in inputs.items():
-        problem = pixels_problem(of, sharpness, _flat(getattr(pixels, part)))
-        layers = trained_plainly(problem, SCHEDULES[part], lambda *at, part=part: print(part, *at, flush=True))
+    for part, columns in inputs.items():
+        problem = pixels_problem(columns, sharpness, _flat(getattr(pixels, part)))
+        layers = trained_plainly(problem, SCHEDULES[part], lambda *words, part=part: print(part, *words, flush=True))
         file = SHIPPED / f"paper_{part}.safetensors"
         note = "see factorlib.reflection.paper_network"
         write_layers(file, layers, torch.float16, inputs=note)

@@ -21,13 +21,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.coarse import rotation_to_ray
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import read_result
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import PhotoPoses, read_photo_poses
 from factorlib.scenes.stage_runs import run_stages
@@ -61,7 +61,7 @@ def without_poses(dataset: Dataset) -> Dataset:
     """Return the dataset without cameras, poses, keypoints and cameras from another program."""
     replace = msgspec.structs.replace
     bare = [[replace(obj, pose=None, keypoints=[]) for obj in photo.objects] for photo in dataset.spec.photos]
-    photos = [replace(p, camera=None, objects=of) for p, of in zip(dataset.spec.photos, bare, strict=True)]
+    photos = [replace(p, camera=None, objects=objects) for p, objects in zip(dataset.spec.photos, bare, strict=True)]
     return replace(dataset, spec=replace(dataset.spec, photos=photos), external={})
 
 

@@ -22,8 +22,8 @@ def rows_of(name: str, metrics: Metrics) -> list[list[str]]:
     if not metrics.resynthesis.mean:
         return []
     errors = metrics.resynthesis.mean["none"]
-    both = errors.estimate, errors.null
-    return [[name, *(format_number(e.dssim, 3) for e in both), *(f"{e.psnr_tonemapped_db:.1f}" for e in both)]]
+    values = errors.estimate, errors.null
+    return [[name, *(format_number(e.dssim, 3) for e in values), *(f"{e.psnr_tonemapped_db:.1f}" for e in values)]]
 
 
 def rows() -> Tables:

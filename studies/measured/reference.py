@@ -125,7 +125,7 @@ def stage_numbers(folder: Path) -> dict[str, float]:
         for path in sorted((folder / stage).glob(pattern)):
             for name, channel in (read_exr(path) if path.suffix == ".exr" else _columns(path)).items():
                 values.setdefault(f"{stage}.{name}", []).append(channel[np.isfinite(channel)].astype(float).ravel())
-    return {name: float(np.sqrt(np.mean(np.square(np.concatenate(of))))) for name, of in values.items()}
+    return {name: float(np.sqrt(np.mean(np.square(np.concatenate(parts))))) for name, parts in values.items()}
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
@@ -179,14 +179,14 @@ def read_stored(name: str = DATASET) -> Stored:
 def summarise(runs: Sequence[dict[str, float | None]], reason: str, before: Stored | None) -> Stored:
     """Return the numbers of runs with several seeds, the default one first.  InputError where a number is missing."""
     values = {path: [run.get(path) for run in runs] for path in runs[0]}
-    if missing := [path for path, of in values.items() if None in of]:
+    if missing := [path for path, samples in values.items() if None in samples]:
         raise InputError(
             "there is no such number",
             file=Path("metrics.json"),
             key=missing[0],
             cure="correct NUMBERS in studies/measured/reference.py",
         )
-    numbers = {path: _number(path, of) for path, of in values.items()}
+    numbers = {path: _number(path, samples) for path, samples in values.items()}
     old = before.numbers if before else {}
     changed = {p: (old[p].value, n.value) for p, n in numbers.items() if p in old and old[p].value != n.value}
     refreshes = [Refresh(reason, changed), *(before.refreshes if before else [])]

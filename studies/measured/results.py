@@ -53,13 +53,13 @@ def main() -> int:
     Returns 1 where one is left as it was.
     """
     known = [*PAGES, *SECTIONS]
-    wanted = os.environ.get("ONLY", "").split() or known
-    for name in wanted:
+    names = os.environ.get("ONLY", "").split() or known
+    for name in names:
         if name not in known:
             raise InputError(f"there is no section '{name}'", key="ONLY", cure=did_you_mean(name, known))
     torch.set_num_threads(1)
-    left = {}
-    for name in wanted:
+    failed = {}
+    for name in names:
         start = time.perf_counter()
         module = import_module(f"studies.measured.{name}")
         try:
@@ -68,13 +68,13 @@ def main() -> int:
                 continue
             tables = module.rows()
         except (InputError, SystemExit) as error:
-            left[name] = error
+            failed[name] = error
             continue
         replace_sections(PAGE, {name: section(name, tables, f"{machine()}, {time.perf_counter() - start:.0f} s")})
         print(f"{PAGE}: {SECTIONS[name]}", flush=True)
-    for name, error in left.items():
+    for name, error in failed.items():
         print(f"'{SECTIONS.get(name, name)}' is left as it was: {error}", file=sys.stderr)
-    return 1 if left else 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

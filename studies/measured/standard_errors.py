@@ -20,7 +20,7 @@ from jaxtyping import Float
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import read_rgb_exr
-from factorlib.results.materials import in_order, read_materials
+from factorlib.results.materials import read_materials, select_materials
 from factorlib.results.metrics import read_metrics
 from studies.measured.light_prior import cell_means
 from studies.measured.tools import markdown_table
@@ -38,7 +38,7 @@ def material_deviations(build: Path, other: Path | None = None) -> dict[str, Flo
     solved = read_materials(build / "export/materials.json").materials
     if other:
         path = other / "export/materials.json"
-        true = dict(zip(solved, in_order(read_materials(path), list(solved), path), strict=True))
+        true = dict(zip(solved, select_materials(read_materials(path), list(solved), path), strict=True))
         sums = (np.sum([[m.diffuse, m.specular] for m in table.values()], axis=(0, 1)) for table in (true, solved))
         factors = dict.fromkeys(true, np.divide(*sums))
     else:

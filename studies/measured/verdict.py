@@ -43,7 +43,7 @@ class VerdictOnSet(NamedTuple):
     degradations: str
     score: float
     trust: str
-    expected: float
+    expected_psnr: float
     terms: list[float]
 
 
@@ -77,7 +77,7 @@ def base_of(seed: int | None) -> Path:
     return generate_set(seed, link_maps(split_maps(maps, seed)[0], PLACE / f"maps-{seed}"))
 
 
-def expected(weights: Float[np.ndarray, " 4"], terms: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
+def expected_psnr(weights: Float[np.ndarray, " 4"], terms: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
     """Return (1) of `factorlib.evaluate.verdict`, dB."""
     return -10 * np.log10(FLOOR + terms @ weights)
 
@@ -86,7 +86,7 @@ def fit_weights(sets: list[VerdictOnSet]) -> Float[np.ndarray, " 4"]:
     """Fit the weights that bring the expected scores nearest to the scores; outliers count less."""
     terms, scores = (np.array([getattr(each, key) for each in sets]) for key in ("terms", "score"))
     start = np.log(list(WEIGHTS.values()))
-    return np.exp(least_squares(lambda w: expected(np.exp(w), terms) - scores, start, loss="soft_l1").x)
+    return np.exp(least_squares(lambda w: expected_psnr(np.exp(w), terms) - scores, start, loss="soft_l1").x)
 
 
 def agreement(predicted: Float[np.ndarray, " n"], sets: list[VerdictOnSet]) -> str:
@@ -111,7 +111,9 @@ def main() -> None:
         print(agreement(np.array([each.expected for each in sets]), sets))
     if sets := kinds.get("fit"):
         print("weights:", dict(zip(WEIGHTS, np.round(fit_weights(sets), 4).tolist(), strict=True)))
-        left_out = [expected(fit_weights([*sets[:k], *sets[k + 1 :]]), np.array(s.terms)) for k, s in enumerate(sets)]
+        left_out = [
+            expected_psnr(fit_weights([*sets[:k], *sets[k + 1 :]]), np.array(s.terms)) for k, s in enumerate(sets)
+        ]
         print("each set left out of the fit:", agreement(np.array(left_out), sets))
     lines = [f"{kind},{each.expected:.3f},{each.score:.3f}" for kind, sets in kinds.items() for each in sets]
     write_text(PLACE / "calibration.csv", "\n".join(["kind,expected_db,true_db", *lines, ""]))

@@ -15,26 +15,9 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import results_folder, verbs
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
-from studies.catalogue import input_errors, matrices, methods
-from studies.study import FULL, QUICK, Scale, Study
+from studies.catalogue import STUDIES
+from studies.study import FULL, QUICK, Scale
 
-STUDIES: dict[str, Study] = {
-    study.name: study
-    for study in (  # in the order of the page
-        matrices.MATRIX_SIZE,
-        matrices.ROW_AND_COLUMN,
-        matrices.STRUCTURE,
-        input_errors.LABEL_QUALITY,
-        input_errors.ALIGNMENT_ERROR,
-        input_errors.PROGRESSIVE,
-        matrices.PAPER_SETS,
-        input_errors.GAUSS_SPHERE,
-        methods.COMPARISON,
-        methods.PRIOR,
-        methods.SPEED,
-        methods.PARTS,
-    )
-}
 SLICES = ("case", "worlds", "sets")
 
 

@@ -9,9 +9,10 @@ import msgspec
 from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.project import LIBRARY, Project
 from factorlib.wholefile import replace_file
+from studies.catalogue import STUDIES
 from studies.conclusion import Conclusion, claims, conclude, csv_text, numbers, paragraph
 from studies.measured.tools import markdown_table, replace_sections
-from studies.run import STUDIES, studies
+from studies.run import studies
 from studies.study import FULL, Scale, Score, Study
 
 DOCS = LIBRARY / "docs" / "studies.md"

@@ -26,11 +26,11 @@ import msgspec
 import numpy as np
 
 from factorlib.evaluate.comparison_gauge import gauge_factors
-from factorlib.evaluate.picture_errors import picture_error, white_of
+from factorlib.evaluate.picture_errors import picture_error, white_level
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.materials import read_materials
 from factorlib.stage import Inputs, Progress
-from studies.baselines import MethodPrediction, grey, projective, rendered
+from studies.baselines import MethodPrediction, predict_by_projection, predict_by_rendering, predict_grey
 from studies.recovery_errors import PARTS, Materials, in_gauge, light_errors, material_errors, read_recovered_maps
 from studies.spheres import Maps, Radiance, SphereView, materials_of, photograph, read_maps, sphere_view
 from studies.steps import Params
@@ -39,7 +39,7 @@ from studies.study import Comparison, Score, World
 VIEWS = {"side": (70.0, 15.0), "back": (160.0, -10.0), "front": (0.0, 0.0)}  # azimuth, elevation of a camera, degrees
 KINDS = ("novel_view", "novel_light", "novel_material")
 SUFFIXES = {"none": "", "scalar_per_set": "_scaled", "channel_per_photo": "_balanced"}
-INSTANT = {"projective": projective, "grey": grey}  # methods that take less than a second
+INSTANT = {"projective": predict_by_projection, "grey": predict_grey}  # methods that take less than a second
 
 
 class UnseenPhoto(msgspec.Struct, frozen=True):
@@ -80,7 +80,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         seconds = round(time.process_time() - start_s, 3)
     else:
         solved = {n: m.reflectance for n, m in read_materials(folder / "materials.json").materials.items()}
-        prediction = rendered(*in_gauge(solved, read_recovered_maps(folder, case.lights), truths))
+        prediction = predict_by_rendering(*in_gauge(solved, read_recovered_maps(folder, case.lights), truths))
         seconds = read_json(folder / "measured.json")["seconds"]
     pictures = predict(case, truths, maps, prediction)
     write_json(
@@ -103,7 +103,9 @@ def predict(case: Comparison, truths: Materials, maps: Maps, prediction: MethodP
             view,
         )
         if predicted is not None:
-            pictures.append(PredictedPhoto(target, view, truth, predicted, white_of(view.picture(truth), view.inside)))
+            pictures.append(
+                PredictedPhoto(target, view, truth, predicted, white_level(view.picture(truth), view.inside))
+            )
     return pictures
 
 
@@ -121,10 +123,10 @@ def score_method(truths: Materials, maps: Maps, prediction: MethodPrediction, pi
     """Score a method by its pictures, and by the materials and lights that it states."""
     score = Score({})
     for kind in KINDS:
-        if some := [picture for picture in pictures if picture.target.kind == kind]:
-            samples = [[getattr(picture, part) for picture in some] for part in ("predicted", "truth", "white")]
+        if group := [picture for picture in pictures if picture.target.kind == kind]:
+            samples = [[getattr(picture, part) for picture in group] for part in ("predicted", "truth", "white")]
             for gauge, factors in gauge_factors(*samples, below_white=True).items():
-                errors = [picture.dssim(factor) for picture, factor in zip(some, factors, strict=True)]
+                errors = [picture.dssim(factor) for picture, factor in zip(group, factors, strict=True)]
                 score |= Score({kind + SUFFIXES[gauge]: float(np.mean(errors))})
     if materials := prediction.materials:  # of a Lambertian method k_d alone
         parts = PARTS if any(any(m.specular) for m in materials.values()) else PARTS[:1]

@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 import msgspec
 import numpy as np
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes

@@ -8,7 +8,7 @@ traces, which every machine has.
 import os
 from pathlib import Path
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.generate.eames import SET, ChairSetOptions, generate
 from factorlib.scenes.stage_runs import run_stages
 from factorlib.stage import Inputs, Progress, silent

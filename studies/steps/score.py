@@ -30,12 +30,12 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.evaluate.ball import octahedral_light
-from factorlib.evaluate.comparison_gauge import connected_components
-from factorlib.evaluate.picture_errors import picture_error, white_of
+from factorlib.evaluate.comparison_gauge import material_components
+from factorlib.evaluate.picture_errors import picture_error, white_level
 from factorlib.evaluate.relighting import INSIDE, Appearances
 from factorlib.evaluate.truth import GREY
 from factorlib.jsonfile import read_json, write_json
-from factorlib.results.materials import Solved, read_materials
+from factorlib.results.materials import SolvedMaterial, read_materials
 from factorlib.stage import Inputs, Progress
 from studies.recovery_errors import (
     Materials,
@@ -65,7 +65,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / f"{inputs.photo}.json", score | Score(read_json(folder / "measured.json")))
 
 
-def score_case(case: Case, truths: Materials, maps: Maps, solved: Mapping[str, Solved], recovered: Maps) -> Score:
+def score_case(
+    case: Case, truths: Materials, maps: Maps, solved: Mapping[str, SolvedMaterial], recovered: Maps
+) -> Score:
     """Return all scores.
 
     Args:
@@ -75,7 +77,7 @@ def score_case(case: Case, truths: Materials, maps: Maps, solved: Mapping[str, S
         solved: Materials of the solve, in its own gauge.
         recovered: Lights of the solve, in its own gauge.
     """
-    component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
+    component = material_components({light_name(li): case.names_in(li) for li in case.lights})
     estimates = {name: solved[name].reflectance for name in component}
     materials = {}
     lights = {}
@@ -91,10 +93,10 @@ def score_case(case: Case, truths: Materials, maps: Maps, solved: Mapping[str, S
         return score
     tint = float(np.std(np.log(gauge_factor(estimates, truths))))
     colours = {"chromaticity": recovered, "true_chromaticity": {li: maps[li] for li in recovered}}
-    return score | Score({name: chromaticity(of_case) for name, of_case in colours.items()} | {"tint": tint})
+    return score | Score({name: chromaticity(case_colours) for name, case_colours in colours.items()} | {"tint": tint})
 
 
-def stated_errors(table: Iterable[Solved]) -> Score:
+def stated_errors(table: Iterable[SolvedMaterial]) -> Score:
     """Return means over materials of the standard errors that the solve states.
 
     They are of roughness, and of k_d + k_s relative to it.
@@ -131,7 +133,7 @@ def sphere_errors(case: Case, materials: Materials, lights: Maps, truths: Materi
 
     def dssim(samples: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:
         truth = _disc(true[light].ball(truths[name]))
-        return picture_error(_disc(samples), truth, INSIDE, white_of(truth, INSIDE)).dssim
+        return picture_error(_disc(samples), truth, INSIDE, white_level(truth, INSIDE)).dssim
 
     names = case.material_names
     pairs = [(name, li) for name in names for li in lights]
@@ -139,7 +141,9 @@ def sphere_errors(case: Case, materials: Materials, lights: Maps, truths: Materi
     subsets = {"entries": pairs, "observed": observed, "unobserved": [p for p in pairs if p not in observed]}
     errors = {(n, li): dssim(recovered[li].ball(materials[n]), n, li) for n, li in pairs}
     flat = {(n, li): dssim(true[li].ball(truths[n]).mean(axis=0, keepdims=True), n, li) for n, li in pairs}
-    means = ({key: _mean(each[p] for p in some) for key, some in subsets.items() if some} for each in (errors, flat))
+    means = (
+        {key: _mean(each[p] for p in subset) for key, subset in subsets.items() if subset} for each in (errors, flat)
+    )
     relit = {n: _mean(dssim(true[li].ball(materials[n]), n, li) for li in true) for n in names}
     values = {"new_light": _mean(relit.values())}
     values |= {"first_material": relit[case.names[0]]} if case.names[0] in relit else {}

@@ -45,8 +45,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         with TemporaryDirectory() as folder:
             start = {}
             if case.objects and case.objects.warm:
-                alone = msgspec.structs.replace(inputs, unfinished=None)  # the two solves must not resume each other's
-                run_solve(dict(list(tables.items())[:-1]), case.solve, alone, Path(folder), progress)
+                # the two solves must not resume each other's
+                fresh_inputs = msgspec.structs.replace(inputs, unfinished=None)
+                run_solve(dict(list(tables.items())[:-1]), case.solve, fresh_inputs, Path(folder), progress)
                 start = {"start": Path(folder)}
             measured["seconds"] = run_solve(tables, case.solve, inputs, home, progress, **start)
     write_json(home / "measured.json", measured)

@@ -10,7 +10,7 @@ from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.read import usable
+from factorlib.meshes.read_mesh import usable
 from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
 
 

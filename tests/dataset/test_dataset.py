@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from factorlib.dataset import schema
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.validation import Validation
 from tests.refusal import refusal

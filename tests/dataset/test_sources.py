@@ -11,7 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.input_checks import convert_intrinsics
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import ExternalCamera
 from factorlib.dataset.slices import dataset_slice
 from factorlib.geometry.camera import Camera, Pose

@@ -28,7 +28,7 @@ from factorlib.results.materials import (
     Reflectance,
     StandardErrors,
     Uncertainty,
-    solved,
+    attach_errors,
 )
 from factorlib.stage import Inputs
 from factorlib.urm.extract import PhotoSource, extract_observations
@@ -179,7 +179,7 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     model = Model(solver="joint", lobes=dict.fromkeys(made.seen, 24))
     gauge = Gauge("the lights are white on the whole")
     for stage in ("solve", "export"):
-        table = MaterialTable({m: solved(each, errors) for m, each in estimates.items()}, gauge, model)
+        table = MaterialTable({m: attach_errors(each, errors) for m, each in estimates.items()}, gauge, model)
         write_json(folders[stage] / "materials.json", table)
         write_json(folders[stage] / "exposures.json", {p: [1.0, 1.0, 1.0] for p in made.seen})
     misfits = {photo: Misfit(0.001, 0.01) for photo in made.seen}

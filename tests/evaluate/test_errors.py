@@ -9,12 +9,12 @@ from factorlib.dataset.schema import RigidTransform
 from factorlib.evaluate.ball import VIEW, OctahedralLight, diffuse_lobe, glossy_lobe, octahedral_light
 from factorlib.evaluate.picture_errors import (
     WINDOW,
-    compared_photo,
+    combine_photo,
     picture_error,
     psnr,
     ssim_map,
-    tone_mapped,
-    white_of,
+    tone_map,
+    white_level,
 )
 from factorlib.evaluate.relighting import compare_lights, compare_relighting, compare_relit_set, light_error, rgb_angle
 from factorlib.evaluate.truth import compare_materials, normal_error, pose_error
@@ -132,7 +132,7 @@ def test_psnr_and_dssim_by_hand(pictures):
     assert picture_error(black, black + 1, whole, 1.0).dssim == pytest.approx(0.49995, abs=1e-5)
     error = picture_error(pictures[0], pictures[0], whole, 1.0)
     assert error.psnr_linear_db == error.psnr_tonemapped_db == 120.0 and error.dssim == pytest.approx(0, abs=1e-6)
-    assert white_of(black, whole) == 1.0 and np.isfinite(tone_mapped(black, 1.0)).all()
+    assert white_level(black, whole) == 1.0 and np.isfinite(tone_map(black, 1.0)).all()
 
 
 def test_ssim_is_its_definition_where_the_window_is_whole(pictures):
@@ -165,9 +165,9 @@ def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds(channels):
     photo, geometry, radiance = channels
     photo["clipped.R"][0, :4], photo["valid"][1, :3] = 1, 0
     geometry["label"][2, :2], geometry["confidence"][3, :7] = 0, 0
-    shot = compared_photo(photo, geometry, radiance)
+    shot = combine_photo(photo, geometry, radiance)
     assert shot.counts == {"pixels": 600 - 9, "unused": 7, "clipped": 4, "invalid": 3, "uncovered": 2}
-    satisfied = [compared_photo(photo, geometry, factor * radiance).clipped_satisfied for factor in (1.5, 0.5)]
+    satisfied = [combine_photo(photo, geometry, factor * radiance).clipped_satisfied for factor in (1.5, 0.5)]
     assert satisfied == [1.0, 0.0]
 
 

@@ -7,11 +7,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.evaluate.ball import ball, constant_light, octahedral_light
+from factorlib.evaluate.ball import ball, octahedral_light, uniform_light
 from factorlib.evaluate.relighting import MEAN_SHOWN, NORMALS
 from factorlib.evaluate.verdict import GOOD, POOR, VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.jsonfile import read_json
-from factorlib.results.materials import Misfit, Reflectance, StandardErrors, solved
+from factorlib.results.materials import Misfit, Reflectance, StandardErrors, attach_errors
 from factorlib.results.metrics import Metrics, Verdict
 from factorlib.runner.verbs import NO_TRUST
 from factorlib.stage import silent
@@ -108,7 +108,7 @@ def test_a_worse_sign_never_raises_what_is_expected():
 
 def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size_change():
     errors = StandardErrors((0.01, 0.004, 0.004), (0.004,) * 3, 0.01)
-    (found,) = ball_changes({"red": solved(TRUE["red"], errors)}, {"day": LIGHT}).values()
+    (found,) = ball_changes({"red": attach_errors(TRUE["red"], errors)}, {"day": LIGHT}).values()
 
     def shown(material: Reflectance) -> np.ndarray:
         return np.clip(ball(LIGHT, material, NORMALS) * exposure, 0, 1) ** (1 / 2.2)
@@ -125,9 +125,9 @@ def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size
         squares.append(np.mean((shown(moved) - shown(TRUE["red"])) ** 2))
     assert found == pytest.approx(np.mean(squares), rel=4 / np.sqrt(60))
     nothing = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
-    assert ball_changes({"red": solved(TRUE["red"], nothing)}, {"day": LIGHT, "grey": constant_light(np.ones(3))}) == {
-        "red": 0.0
-    }
+    assert ball_changes(
+        {"red": attach_errors(TRUE["red"], nothing)}, {"day": LIGHT, "grey": uniform_light(np.ones(3))}
+    ) == {"red": 0.0}
 
 
 def test_the_text_begins_with_the_word_that_the_runner_looks_for():

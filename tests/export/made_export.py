@@ -17,8 +17,8 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
-from factorlib.light.lobes import SUN, Lobes, lobe_integral
-from factorlib.meshes.read import read_mesh
+from factorlib.light.lobes import SUN, Lobes, lobe_energy
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobe_table import write_lobes
 from factorlib.stage import Inputs
@@ -54,14 +54,14 @@ def light(seed: int) -> Lobes:
 
 def with_sun(lobes: Lobes, axis: tuple[float, float, float], irradiance: tuple[float, float, float]) -> Lobes:
     """The light with a sun beside it; axis: toward it, unit."""
-    weight = np.array(irradiance) / lobe_integral(np.array([SUN]))
+    weight = np.array(irradiance) / lobe_energy(np.array([SUN]))
     return Lobes(np.vstack([lobes.axis, axis]), np.append(lobes.sharpness, SUN), np.vstack([lobes.weight, weight]))
 
 
 def lights() -> dict[str, Lobes]:
     """By illumination, each in its own frame; a sun shines into the room."""
     room = with_sun(light(1), SUN_DIRECTION, (1.2, 1.0, 0.7))
-    return {"front": light(0), "room": room.turned(WORLD_FROM_CAMERA["side"])}
+    return {"front": light(0), "room": room.rotate(WORLD_FROM_CAMERA["side"])}
 
 
 def write_obj(path: Path, radii: tuple[float, float, float], rows: int = 48) -> None:

@@ -25,7 +25,7 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.brdf import ggx, specular
 from factorlib.results.lobe_table import read_lobes, write_lobes
-from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, read_materials, solved
+from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, attach_errors, read_materials
 from factorlib.stage import silent
 from stages import export
 from tests.export import made_export
@@ -160,8 +160,8 @@ def test_factor_leaves_headroom_and_touches_nothing_that_has_it(scale):
 
 
 def test_gauge_scales_reflectances_and_their_errors_only_and_says_so():
-    before = solved(Reflectance((0.8,) * 3, (0.4,) * 3, 0.3), StandardErrors((0.1,) * 3, (0.2,) * 3, 0.05))
-    half = solved(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))
+    before = attach_errors(Reflectance((0.8,) * 3, (0.4,) * 3, 0.3), StandardErrors((0.1,) * 3, (0.2,) * 3, 0.05))
+    half = attach_errors(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))
     found = table_in_gauge(MaterialTable({"a": before}, Gauge(rule="x")), 0.5)
     assert found.materials == {"a": half} and found.gauge.rule == "x" and found.gauge.export_factor == 0.5
 
@@ -286,7 +286,7 @@ def hemisphere(no: float, count: int = 600) -> tuple[Angles, float]:
 
 def test_the_solved_model_is_the_operators():
     angles, _ = hemisphere(0.7, 40)
-    mine = distribution(GREY.alpha, angles.nh) * other_renderers.separable(GREY.alpha, angles) * angles.ni
+    mine = distribution(GREY.alpha, angles.nh) * other_renderers.separable_smith(GREY.alpha, angles) * angles.ni
     alpha, ni, no, nh = (torch.tensor(a, dtype=torch.float64) for a in (GREY.alpha, angles.ni, angles.no, angles.nh))
     np.testing.assert_allclose(mine, specular(alpha, ni, no, nh), rtol=1e-9)
     np.testing.assert_allclose(distribution(GREY.alpha, angles.nh), ggx(alpha, nh), rtol=1e-9)
@@ -294,5 +294,5 @@ def test_the_solved_model_is_the_operators():
     normal, view = (torch.tensor([v], dtype=torch.float64) for v in ([0.0, 0.0, 1.0], [np.sqrt(1 - 0.49), 0.0, 0.7]))
     expected = reflection_operator("reference")(sky, GREY, normal, view)
     np.testing.assert_allclose(
-        other_renderers.in_sky(GREY, other_renderers.solved, np.array([0.7])), expected, rtol=2e-3
+        other_renderers.integrate_sky(GREY, other_renderers.evaluate_solved_brdf, np.array([0.7])), expected, rtol=2e-3
     )

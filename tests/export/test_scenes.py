@@ -21,13 +21,13 @@ from factorlib.geometry.camera import Camera
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply_stl_off import submesh, write_ply
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.reflection.reference import Reference
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
-from factorlib.render.resynthesis import Reflector, resynthesised
-from factorlib.results.lobe_table import light_of, read_lobes
+from factorlib.render.resynthesis import Reflector, resynthesise
+from factorlib.results.lobe_table import read_lobes, read_photo_light
 from factorlib.results.materials import Reflectance, read_materials
-from factorlib.tracing.scene import mitsuba_map, node_directions, paint, rigid, sharpened
+from factorlib.tracing.scene import mitsuba_map, node_directions, paint, rigid, sharpen_lobes
 from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
 
@@ -60,11 +60,11 @@ def whole_pixels(label: np.ndarray) -> np.ndarray:
 def test_scene_equals_resynthesis(exported, photo):
     inputs, out = exported
     geometry, masks = (read_exr(inputs[stage] / f"{photo}.exr") for stage in ("align", "masks"))
-    light = light_of(out, photo, msgspec.convert(inputs.facts["dataset.light"][photo], LightSlice))
+    light = read_photo_light(out, photo, msgspec.convert(inputs.facts["dataset.light"][photo], LightSlice))
     table = read_materials(out / "materials.json").materials
     pixels = whole_pixels(geometry["label"])
     reflector, materials = Reflector(Reference(tolerance=1e-3), light), [table[n] for n in made_export.NAMES]
-    expected = resynthesised(reflector, materials, {"label": masks["label"] * pixels}, geometry)
+    expected = resynthesise(reflector, materials, {"label": masks["label"] * pixels}, geometry)
     found = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
     error = block_means(found, pixels) / block_means(expected, pixels) - 1
     assert len(error) >= 15
@@ -165,7 +165,7 @@ def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
 def test_sharpening_undoes_what_interpolation_widens():
     lobe, spacing = Lobes(np.array([[0.0, 0.0, 1.0]]), np.array([2000.0]), np.ones((1, 3))), 0.0125
     x, nodes = np.linspace(-0.2, 0.2, 20001), np.arange(-20, 21) * spacing
-    interpolated = np.interp(x, nodes, np.exp(-0.5 * sharpened(lobe, spacing).sharpness[0] * nodes**2))
+    interpolated = np.interp(x, nodes, np.exp(-0.5 * sharpen_lobes(lobe, spacing).sharpness[0] * nodes**2))
     assert (x**2 * interpolated).sum() / interpolated.sum() == pytest.approx(1 / 2000.0, rel=1e-3)
 
 
@@ -282,7 +282,7 @@ def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
     assert dome.GetTextureFormatAttr().Get() == "latlong" and file
     found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
     name, world = ("front", np.eye(3)) if photo == "front" else ("room", made_export.WORLD_FROM_CAMERA["side"])
-    light = read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)
+    light = read_lobes(exported[1] / "lobes.parquet")[name].scale(made_export.EXPOSURES[photo][0]).rotate(world.T)
     directions = lat_long_directions(8, 16).reshape(-1, 3)[16:-16] @ YUP_FROM_CAMERA
     x, y, z = (directions @ YUP_FROM_CAMERA @ world_of(dome.GetPrim())[:3, :3]).T
     rows, columns = (np.pi / 2 - np.arcsin(y)) / np.pi * ROWS, (np.pi - np.arctan2(x, z)) / (2 * np.pi) * 2 * ROWS

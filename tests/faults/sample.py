@@ -19,18 +19,18 @@ import msgspec
 import numpy as np
 import yaml
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import PhotoSlice
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.jsonfile import read_json
-from factorlib.labels.labels import read_labels
+from factorlib.labels.label_image import read_labels
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.poses import read_poses
-from factorlib.results.solution import read_earlier
+from factorlib.results.solution import read_earlier_solution
 from factorlib.stage import Inputs
 from factorlib.urm.observations import Observations, read_observations, write_observations
 from factorlib.validation import Validation
@@ -363,7 +363,7 @@ READERS = {  # reader -> who reads a file of the data set's folder
     "true normals": lambda folder, name: read_true_normals(folder / name, "hall", (W, H)),
     "observations": lambda folder, name: read_observations(folder / name),
     "lobes": lambda folder, name: read_lobes(folder / name),
-    "solution": lambda folder, _: read_earlier(folder / "solve"),
+    "solution": lambda folder, _: read_earlier_solution(folder / "solve"),
     "poses": lambda folder, name: read_poses(folder / name),
     "json": lambda folder, name: read_json(folder / name),
     "yaml": lambda folder, name: read_yaml(folder / name, dict, most_values=2000),

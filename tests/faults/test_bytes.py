@@ -33,14 +33,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.errors import InputError
-from factorlib.images.exr import encoded, write_exr, write_rgb_exr
+from factorlib.images.exr import encode_pixels, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.read import read_mesh
-from factorlib.recipe.read import read_recipe
+from factorlib.meshes.read_mesh import read_mesh
+from factorlib.recipe.read_recipe import read_recipe
 from factorlib.reflection.network import Layers, write_layers
 from factorlib.results.lobe_table import write_lobes
 from factorlib.runner import verbs
@@ -887,7 +887,7 @@ LAYERS = Layers(torch.zeros(8), torch.ones(8), [torch.ones(32, 8), torch.ones(1,
 WRITERS = {  # file -> who writes it, one for each way that bytes reach a disk; what stands after a blank tells those of one kind apart
     "a.exr": lambda path: write_exr(path, {f"n.{k}": PIXELS[..., 0] for k in range(7)}),
     "a.png": lambda path: write_png(path, CODES),
-    "a.jpg": lambda path: write_bytes(path, encoded(path, CODES, {"Compression": "jpeg:95"})),
+    "a.jpg": lambda path: write_bytes(path, encode_pixels(path, CODES, {"Compression": "jpeg:95"})),
     "a.json": lambda path: write_json(path, {"a": PIXELS.tolist()}),
     "a.json of the runner": lambda path: replace_file(path, b"{}" * 2000),
     "a.parquet": lambda path: write_observations(path, sample.observations(2000)),

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.generate import eames, folder, surroundings, synthetic
-from factorlib.generate.chair import chair, labelled
+from factorlib.generate.chair import chair, label_parts
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
 from factorlib.light.latlong import sample_map
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from tests.refusal import refusal
 from tests.runner.toy import files_of
 
@@ -76,12 +76,12 @@ def test_a_users_lights_replace_the_made_ones(tmp_path):
     light = np.ones((32, 64, 3)) * [1.0, 2.0, 3.0]
     light[3, 7] = 100
     write_rgb_exr(tmp_path / "sky.exr", light)
-    taken = surroundings.captured(tmp_path / "sky.exr", 16)
+    taken = surroundings.read_captured_light(tmp_path / "sky.exr", 16)
     assert taken.shape == (16, 32, 3)
     assert np.unravel_index(taken[..., 0].argmax(), (16, 32)) == (1, 3)
     assert taken.mean() == pytest.approx(1)
     write_rgb_exr(tmp_path / "square.exr", np.ones((8, 8, 3)))
-    refusal("no lat-long", surroundings.captured, tmp_path / "square.exr", 8)
+    refusal("no lat-long", surroundings.read_captured_light, tmp_path / "square.exr", 8)
 
 
 def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
@@ -92,7 +92,7 @@ def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
     assert np.allclose(thing.pose.translation, dataset.truth.poses["kitchen"][thing.name].translation, atol=1e-6)
     assert photo.camera.focal_px == pytest.approx(folder.focal_px_of_35mm(45, 96, 72), abs=0.01)
     mesh = read_mesh(exact / "meshes/chair.obj", ["red", "wood"], {"shell": "red", "legs": "wood"})
-    traced = labelled(chair(), {"shell": 1, "legs": 2})
+    traced = label_parts(chair(), {"shell": 1, "legs": 2})
     assert len(mesh.faces) == len(traced.faces)
     apart, nearest = cKDTree(traced.vertices).query(mesh.vertices)
     assert apart.max() < 1e-6 and len(set(nearest)) == len(traced.vertices)

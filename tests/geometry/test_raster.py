@@ -7,9 +7,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.occlusion import Occluders, SurfacePoints
 from factorlib.geometry.raster import rasterise
 from factorlib.geometry.sphere import BINS, NO_OCCLUDER, fibonacci_sphere, mirror_directions
-from factorlib.geometry.visibility import Occluders, SurfacePoints
 from tests.align.scenes import ball, blob, mesh_of, photo_of
 
 CAMERA = Camera(64, 48, 80.0, (30.0, 25.0))
@@ -129,8 +129,8 @@ def test_codes_say_which_material_hides_a_direction_and_how_it_faces():
     up = np.tile([0.0, 0.0, -1.0], (2, 1))
     past = occluders.visibility_from(SurfacePoints(place, up, np.ones(2, bool)), up, directions)
     hidden = past.visibility == 0
-    assert hidden[0].any() and (past.met[~hidden] == NO_OCCLUDER).all()
-    material, faces = np.divmod(past.met[hidden].astype(int), BINS)
+    assert hidden[0].any() and (past.occluder[~hidden] == NO_OCCLUDER).all()
+    material, faces = np.divmod(past.occluder[hidden].astype(int), BINS)
     assert (material == 2).all()
     row, k = np.nonzero(hidden)
     toward_floor = np.sum(fibonacci_sphere(BINS)[faces] * directions[k], 1)

@@ -11,7 +11,7 @@ from PIL.TiffImagePlugin import IFDRational
 from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.photo import box_mean, check_bright, decoded, open_photo, read_photo
+from factorlib.images.photo import box_mean, check_bright, decode_photo, open_photo, read_photo
 from factorlib.images.tone import srgb_decode, srgb_encode
 from tests.images.made_dng import BLACK, LONG, RATIONAL, SHORT, WHITE, write_dng
 from tests.refusal import refusal
@@ -72,7 +72,7 @@ def test_orientation_is_applied_before_averaging_down(tmp_path, orientation, fil
     pixels = np.ascontiguousarray(pixels[:11, :17])  # nothing comes out even, so that the displayed corner matters
     path = save(tmp_path / file, pixels, Orientation=orientation)
     expected = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path))).get_pixels(oiio.FLOAT)
-    whole, small = read_photo(path), decoded(open_photo(path), None, 3, path)
+    whole, small = read_photo(path), decode_photo(open_photo(path), None, 3, path)
     assert (whole.height, whole.width) == expected.shape[:2] == ((17, 11) if orientation >= 5 else (11, 17))
     shown = srgb_encode(whole.radiance) if file == "a.tif" else whole.radiance
     np.testing.assert_allclose(shown, expected, atol=1e-5)
@@ -142,7 +142,7 @@ def test_focal_of_35mm_film_is_the_same_for_any_size_orientation_and_average(tmp
         photo = read_photo(path)
         half = np.hypot(photo.width, photo.height) / 2
         assert np.arctan(half / photo.focal_px) == pytest.approx(np.arctan(FILM_DIAGONAL / 2 / 50))
-        assert decoded(open_photo(path), None, 4, path).focal_px == pytest.approx(photo.focal_px / 4)
+        assert decode_photo(open_photo(path), None, 4, path).focal_px == pytest.approx(photo.focal_px / 4)
 
 
 # ── Raw photos: what the sensor saw, not the preview beside it; linear, and clipped where the sensor was ────────────
@@ -256,7 +256,7 @@ def test_heif_is_the_radiance_that_was_written_in_all_its_bits_and_top_codes_are
 @pytest.mark.parametrize("orientation, turns", [(1, 0), (3, 2), (6, 3), (8, 1)])
 def test_orientation_is_applied_once_and_what_the_camera_wrote_is_read(tmp_path, orientation, turns):
     path, turned = save_heif(tmp_path / "a.heic", SMOOTH, exif=read_exif(orientation)), np.rot90(SMOOTH, turns)
-    photo, small = read_photo(path), decoded(open_photo(path), None, 4, path)
+    photo, small = read_photo(path), decode_photo(open_photo(path), None, 4, path)
     assert photo.radiance.shape == turned.shape and open_photo(path).size == turned.shape[:2]
     np.testing.assert_allclose(photo.radiance, turned, atol=0.015)
     assert photo.exposure == pytest.approx(200 / 50 / 4)

@@ -11,7 +11,13 @@ from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
-from factorlib.scenes.joint_problems import MATERIALS, block, observations_from_front, random_light, sphere_normals
+from factorlib.scenes.joint_problems import (
+    MATERIALS,
+    observations_from_front,
+    random_light,
+    sphere_block,
+    sphere_normals,
+)
 from factorlib.urm.observations import Observations
 from tests.integral import reflected
 
@@ -36,7 +42,7 @@ def photos_in_a_wrong_light(kind: str, curves: bool = False) -> Illumination:
     `hidden`, in a light fixed to the world, each photo hiding other directions."""
     rng = np.random.default_rng(1)
     size = 16 if kind == "clipped" else 14
-    data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=size)
+    data = sphere_block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=size)
     if kind == "clipped":
         clipped = data.radiance > np.quantile(data.radiance, 0.9)
         return guessed(
@@ -57,7 +63,9 @@ def three_rooms() -> tuple[JointProblem, Point]:
     """Three materials in three lights, and a wrong point."""
     rng = np.random.default_rng(4)
     lights = [random_light(rng, 3) for _ in range(3)]
-    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10) for k, light in enumerate(lights)]
+    blocks = [
+        sphere_block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10) for k, light in enumerate(lights)
+    ]
     guess = [random_light(rng, 4) for _ in range(3)]
     return JointProblem(blocks, OPERATOR), Point(
         MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess]

@@ -15,7 +15,7 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import constant_light, rotated_cells
 from factorlib.light.prior import MIX, read_light_prior
 from factorlib.reflection import reflection_operator
-from factorlib.scenes.joint_problems import MATERIALS, block
+from factorlib.scenes.joint_problems import MATERIALS, sphere_block
 from tests.inference.made import in_units_of
 
 FEW = 120  # cells, so that tests are quick
@@ -51,7 +51,7 @@ def spheres(lights, materials=MATERIALS, shown=(0, 1, 2), size=14, noise=0.3, se
     """Noisy spheres of `shown` materials in each of the lights, named room0 and so on."""
     blocks, rng = [], np.random.default_rng(seed)
     for k, light in enumerate(lights):
-        clean = block(f"room{k}", light, materials, list(shown), OPERATOR, size=size)
+        clean = sphere_block(f"room{k}", light, materials, list(shown), OPERATOR, size=size)
         noisy = clean.radiance + noise * rng.normal(size=clean.radiance.shape) / clean.precision
         blocks.append(msgspec.structs.replace(clean, radiance=np.maximum(noisy, 0.0)))
     return JointProblem(blocks, OPERATOR)

@@ -60,7 +60,7 @@ def test_models_swapped_change_the_sign_and_the_order_of_lights_and_the_scale_of
 def test_no_gain_is_no_evidence_either_way(lights):
     same, _ = made(0, lights)
     found = compare_models(same, same, CLEARLY_FOR)
-    assert not found.kept and found.margin == 0 and compare_models(same, same, CLEARLY_AGAINST).kept
+    assert not found.accepted and found.margin == 0 and compare_models(same, same, CLEARLY_AGAINST).accepted
 
 
 def test_nothing_held_out_decides_nothing():
@@ -68,7 +68,7 @@ def test_nothing_held_out_decides_nothing():
     numbers = nothing.astype(int)
     for least in (CLEARLY_FOR, CLEARLY_AGAINST):
         found = compare_models(Losses([nothing], [numbers]), Losses([nothing], [numbers]), least)
-        assert not found.kept and found.margin is None and found.held_out_loss_with is None
+        assert not found.accepted and found.margin is None and found.held_out_loss_with is None
     both = [Losses([nothing, *of.values], [numbers, *of.clusters]) for of in (one, better)]
     assert compare_models(*both, CLEARLY_FOR).margin == pytest.approx(compare_models(one, better, CLEARLY_FOR).margin)
 
@@ -85,9 +85,9 @@ def test_chance_is_rarely_evidence_though_residuals_are_alike():
             Losses([v * e[k][c] for v, e, c in zip(same.values, err, same.clusters, strict=True)], same.clusters)
             for k in (0, 1)
         ]
-        kept.append(compare_models(*both, CLEARLY_FOR).kept)
+        kept.append(compare_models(*both, CLEARLY_FOR).accepted)
         alone = [Losses(of.values, [np.arange(len(v)) for v in of.values]) for of in both]
-        singly.append(compare_models(*alone, CLEARLY_FOR).kept)
+        singly.append(compare_models(*alone, CLEARLY_FOR).accepted)
     assert np.mean(kept) < 0.05 and np.mean(singly) > 3 * np.mean(kept), (np.mean(kept), np.mean(singly))
 
 
@@ -98,7 +98,9 @@ def test_each_light_counts_relative_to_itself():
     assert sum(losses.sum() for losses in richer) > sum(losses.sum() for losses in without)
     numbers = [np.arange(len(v)) for v in without]
     found = compare_models(Losses(without, numbers), Losses(richer, numbers), CLEARLY_FOR)
-    assert found.kept and not compare_models(Losses(richer, numbers), Losses(without, numbers), CLEARLY_FOR).kept
+    assert (
+        found.accepted and not compare_models(Losses(richer, numbers), Losses(without, numbers), CLEARLY_FOR).accepted
+    )
     logarithms = np.log([[1, 1, 200], [0.5, 0.5, 202]]) @ [0.25, 0.25, 0.5]  # by their counts
     np.testing.assert_allclose([found.held_out_loss_without, found.held_out_loss_with], np.exp(logarithms), rtol=1e-3)
     exact, numbers = np.full(5, 1e-9), [np.arange(5)]
@@ -117,4 +119,4 @@ def test_losses_are_those_of_held_out_observations_or_of_all():
             assert len(values) == len(clusters) == (block.held_out.sum() or len(block))
     worse = msgspec.structs.replace(MATERIALS, diffuse=2 * MATERIALS.diffuse)
     richer, without = (held_out_losses(problem, Point(materials, true)) for materials in (MATERIALS, worse))
-    assert compare_models(without, richer, CLEARLY_FOR).kept
+    assert compare_models(without, richer, CLEARLY_FOR).accepted

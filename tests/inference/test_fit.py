@@ -16,13 +16,13 @@ from factorlib.inference.fit import (
 )
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import cholesky_factor
+from factorlib.inference.material_prior import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, MaterialPrior, material_unknowns
 from factorlib.inference.materials import Materials
 from factorlib.inference.optimizer import Arrow, Descent, determinant_terms
-from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve
-from factorlib.inference.priors import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, MaterialPrior, material_unknowns
+from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve_paper
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.scenes.joint_problems import MATERIALS, block, factor_between, random_light
+from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block
 from tests.inference.made_lights import (
     FEW,
     OPERATOR,
@@ -214,12 +214,13 @@ BRIEF = PaperOptions(lobes=8, samplings=200)
 def rooms(photos=1, size=16):
     rng = np.random.default_rng(3)
     return [
-        block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=size) for i in range(2)
+        sphere_block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=size)
+        for i in range(2)
     ]
 
 
 def paper_fit(blocks, paper=BRIEF):
-    return solve(JointProblem(blocks, OPERATOR), 3, paper)
+    return solve_paper(JointProblem(blocks, OPERATOR), 3, paper)
 
 
 @pytest.fixture(scope="module")

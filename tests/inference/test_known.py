@@ -13,16 +13,16 @@ from factorlib.inference.gauge import BRIGHTEST, fix_gauge
 from factorlib.inference.identifiability import tinted_alike
 from factorlib.inference.known import KnownValues, light_from_ball, light_from_map
 from factorlib.inference.lights import Light
+from factorlib.inference.material_prior import MaterialPrior, PriorTerms, material_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, Point
 from factorlib.inference.misfit import unexplained_shares
 from factorlib.inference.optimizer import Descent, step_light
-from factorlib.inference.priors import MaterialPrior, PriorTerms, material_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import insert_known
 from factorlib.inference.uncertainty import LARGEST_RELATIVE_ERROR, Posterior, project_to_gauge
 from factorlib.light.latlong import map_energy
 from factorlib.reflection import reflection_operator
-from factorlib.scenes.joint_problems import MATERIALS, block, factor_between, random_light, sphere_normals
+from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block, sphere_normals
 from tests.inference.made import in_units_of, observations_from_front
 from tests.inference.made_lights import (
     FEW,
@@ -289,7 +289,7 @@ def test_a_colour_that_all_lights_have_is_named_where_interreflection_fixes_it(t
     rng, operator = np.random.default_rng(0), reflection_operator("closed_form", dtype="float64")
     replaced, lights = msgspec.structs.replace, [random_light(rng, 3) for _ in tints]
     grey = [replaced(one, weight=np.repeat(one.weight.mean(1, keepdims=True), 3, axis=1)) for one in lights]
-    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], operator, size=6) for k, light in enumerate(grey)]
+    blocks = [sphere_block(f"room{k}", light, MATERIALS, [0, 1, 2], operator, size=6) for k, light in enumerate(grey)]
     if bounced:
         blocks = [replaced(one, bounced=np.zeros((len(one), 6))) for one in blocks]
     pairs = enumerate(zip(grey, tints, strict=True))
@@ -309,7 +309,7 @@ def exact():
     """Two lights, two photos of the second, each showing three balls, at the truth."""
     rng = np.random.default_rng(3)
     lights = [random_light(rng, 3), random_light(rng, 3, photos=2)]
-    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR) for k, light in enumerate(lights)]
+    blocks = [sphere_block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR) for k, light in enumerate(lights)]
     return JointProblem(blocks, OPERATOR), Point(MATERIALS, in_units_of(blocks, lights))
 
 

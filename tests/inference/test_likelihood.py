@@ -10,8 +10,7 @@ from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.forward import Illumination
 from factorlib.inference.likelihood import EXPOSURE_DEVIATION, TONE_DEVIATION
-from factorlib.inference.materials import Materials
-from factorlib.inference.priors import (
+from factorlib.inference.material_prior import (
     MaterialPrior,
     Mixture,
     likeliest_class,
@@ -19,9 +18,10 @@ from factorlib.inference.priors import (
     materials_from_unknowns,
     shipped_classes,
 )
+from factorlib.inference.materials import Materials
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.responses import ResponseTable
-from factorlib.scenes.joint_problems import MATERIALS, block
+from factorlib.scenes.joint_problems import MATERIALS, sphere_block
 from tests.inference.made import none_held_out
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, likelihood, on_even_cells, photographed, spheres
 
@@ -169,7 +169,7 @@ def made(seed, photos=1, toned=False, hidden=False, bounced=False, clipped=False
     exposure = [0.0, *rng.normal(0, 0.5, photos - 1)]
     light = on_even_cells(drawn(seed, TABLE_CELLS) * 0.6, exposure, rng.uniform(-0.25, 0.25, photos) if toned else ())
     materials = Materials(rng.uniform(0.05, 0.6, (2, 3)), rng.uniform(0.03, 0.4, (2, 3)), rng.uniform(0.12, 0.9, 2))
-    data = block(f"room{seed}", light, materials, [0, 1], OPERATOR, size=8)
+    data = sphere_block(f"room{seed}", light, materials, [0, 1], OPERATOR, size=8)
     light = light.with_log_radiance(light.log_radiance - np.log(data.unit))
     n = len(data)
     if hidden:

@@ -58,7 +58,7 @@ def lit_bowls(name, seed) -> Observations:
     exits = -normals[:, None] + 2 * (normals @ d.T)[..., None] * d
     facing = occluder_codes(np.zeros(exits.shape[0] * 256, int), -exits.reshape(-1, 3)).reshape(-1, 256)
     met = np.vstack([facing + 64 * (k // 2) for k in range(6)])
-    seen = msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, met, NO_OCCLUDER).astype(np.uint16))
+    seen = msgspec.structs.replace(seen, occluder=np.where(seen.visibility == 0, met, NO_OCCLUDER).astype(np.uint16))
     shown = seen.radiance
     for _ in range(8):
         sent = bounced_light(seen, shown)
@@ -85,7 +85,7 @@ def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_t
         factor = factor_between(found, MATERIALS)
         off = found.diffuse * factor / MATERIALS.diffuse - 1, found.roughness - MATERIALS.roughness
         error[choice] = [np.abs(each).mean() for each in off]
-    assert solution.shadows.kept and solution.shadows.margin > CLEARLY_FOR
+    assert solution.shadows.accepted and solution.shadows.margin > CLEARLY_FOR
     assert solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
     assert error["auto"][0] < 0.5 * error["off"][0], error
     assert error["auto"][1] < error["off"][1] + 0.01, error
@@ -97,7 +97,7 @@ def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are
         solution = solved(lit, OF_SHAPES, self_shadowing="on", interreflection=choice)
         off = solution.point.materials.diffuse / MATERIALS.diffuse - 1  # absolute: no factor is taken out
         error[choice] = np.abs(off).mean()
-    assert solution.interreflection.kept and solution.interreflection.log_bayes_factor > VERY_STRONG
+    assert solution.interreflection.accepted and solution.interreflection.log_bayes_factor > VERY_STRONG
     assert error["auto"] < 0.5 * error["off"], error
 
 
@@ -110,14 +110,14 @@ def hull(seen: Observations) -> Observations:
         seen,
         normal=(shallow / np.linalg.norm(shallow, axis=1, keepdims=True)).astype(seen.normal.dtype),
         visibility=np.where(hidden, 0, 255).astype(np.uint8),
-        met=np.where(hidden, seen.met, NO_OCCLUDER).astype(np.uint16),
+        occluder=np.where(hidden, seen.occluder, NO_OCCLUDER).astype(np.uint16),
     )
 
 
 def test_bounces_of_a_hull_without_hollows_do_not_darken_the_materials():
     blocks = [blocks_of_observations(hull(seen), Noise(0.02, 0.02))[0] for seen in lit_rooms(20)]
     solution = solved(blocks, OF_SHAPES)
-    assert not solution.interreflection.kept, solution.interreflection
+    assert not solution.interreflection.accepted, solution.interreflection
     assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
 
 
@@ -132,9 +132,9 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
     wrong = hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5))
     few = {"cells": 24, "observations": 150, "tone": "off"}
     found = solved(wrong, **few)
-    assert not found.shadows.kept and found.shadows.margin < CLEARLY_AGAINST
-    assert solved(wrong, **few, self_shadowing="on").shadows.kept
-    assert solved(hiding(lambda b: np.full((len(b), 96), 255)), **few).shadows.kept
+    assert not found.shadows.accepted and found.shadows.margin < CLEARLY_AGAINST
+    assert solved(wrong, **few, self_shadowing="on").shadows.accepted
+    assert solved(hiding(lambda b: np.full((len(b), 96), 255)), **few).shadows.accepted
 
 
 # ── tone curves ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -176,9 +176,9 @@ def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_loss
     )  # what all photos share, a light of more contrast nearly explains
     assert all(len(e) == 0 for e in exponents_of(without))
     assert error_of(found) < 0.4 * error_of(without), (error_of(found), error_of(without))
-    assert [one.kept for one in found.tone][:2] == [True, True]
+    assert [one.accepted for one in found.tone][:2] == [True, True]
     for one in found.tone:
-        assert one.kept == (
+        assert one.accepted == (
             one.margin > CLEARLY_FOR and one.held_out_loss_without > (1 + LEAST_TONE_GAIN) * one.held_out_loss_with
         )
 
@@ -194,7 +194,7 @@ def test_a_curve_that_no_camera_has_is_not_believed():
     solution = solved(blocks, cells=40, observations=200)
     assert len(exponents_of(solution)[0]) == 0
     (one, *_) = solution.tone
-    assert one.held_out_loss_with < 0.8 * one.held_out_loss_without and not one.kept
+    assert one.held_out_loss_with < 0.8 * one.held_out_loss_without and not one.accepted
 
 
 def test_an_exponent_near_its_bounds_is_named():
@@ -209,9 +209,9 @@ def test_an_exponent_near_its_bounds_is_named():
 def test_without_held_out_observations_shadows_stay_and_tone_curves_are_not_tried(lit):
     """They would be judged by the observations that they were fitted to; marginal likelihoods need none."""
     found = solved([none_held_out(block) for block in lit], QUICK, cells=24, observations=100)
-    assert found.shadows.kept and found.shadows.margin is None
+    assert found.shadows.accepted and found.shadows.margin is None
     assert found.interreflection.log_bayes_factor is not None
-    assert not any(one.kept for one in found.tone) and found.splitting == []
+    assert not any(one.accepted for one in found.tone) and found.splitting == []
 
 
 def test_without_interreflection_the_gauge_is_fixed_though_surfaces_light_each_other(lit):
@@ -222,7 +222,7 @@ def test_without_interreflection_the_gauge_is_fixed_though_surfaces_light_each_o
 def test_one_cluster_is_no_evidence():
     """Its losses have no standard error: a change of 0.05 % had a margin of 5e8."""
     one, other = (Losses([np.full(20, value)], [np.zeros(20, int)]) for value in (1.0005, 1.0))
-    assert not compare_models(one, other, CLEARLY_FOR).kept
+    assert not compare_models(one, other, CLEARLY_FOR).accepted
 
 
 def test_few_materials_start_from_several_roughnesses_and_many_from_one():
@@ -255,9 +255,9 @@ def photographed_at(*curvatures):
 def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     blocks = photographed_at(0.2, 0.0, 0.2)
     found, far = (solved(blocks, MANY, tone="off", distance=distance) for distance in ("auto", "off"))
-    assert [one.kept for one in found.distances] == [True, False, True]
+    assert [one.accepted for one in found.distances] == [True, False, True]
     assert [light.curvature for light in found.point.lights] == [0.2, 0, 0.2]
-    assert all(one.kept == (one.log_bayes_factor > VERY_STRONG) for one in found.distances)
+    assert all(one.accepted == (one.log_bayes_factor > VERY_STRONG) for one in found.distances)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
     assert error_of(found) < 0.5 * error_of(far), (error_of(found), error_of(far))
 

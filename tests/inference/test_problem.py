@@ -14,8 +14,8 @@ from factorlib.inference.materials import Materials, Point
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
-from factorlib.light.lobes import lobe_integral
-from factorlib.scenes.joint_problems import MATERIALS, block, random_light
+from factorlib.light.lobes import lobe_energy
+from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_block
 from factorlib.urm.observations import Observations
 from tests.inference.made import (
     OPERATOR,
@@ -87,7 +87,7 @@ def test_model_in_shadow_is_the_radiance_traced_in_bowls_by_brute_force(seed):
 def test_components_of_unlinked_photos():
     rng = np.random.default_rng(6)
     pairs = (("a", [0, 1]), ("b", [2]))
-    blocks = [block(name, random_light(rng, 1), MATERIALS, shown, OPERATOR, size=8) for name, shown in pairs]
+    blocks = [sphere_block(name, random_light(rng, 1), MATERIALS, shown, OPERATOR, size=8) for name, shown in pairs]
     assert connected_components(blocks, 4) == [((0, 1), ("a",)), ((2,), ("b",)), ((3,), ())]
 
 
@@ -107,9 +107,9 @@ def test_the_gauge_changes_no_radiance_and_a_shifted_point_comes_to_the_same_one
 def test_a_single_light_comes_out_grey_and_a_lobe_made_sharper_at_its_energy_moves_no_tint():
     """The gauge depends on what lights send, not on how lobes make it up."""
     light = random_light(np.random.default_rng(2), 4)
-    data = block("room", light, MATERIALS, [0, 1, 2], OPERATOR, size=8)
+    data = sphere_block("room", light, MATERIALS, [0, 1, 2], OPERATOR, size=8)
     sharper = light.log_sharpness + np.array([2.0, 0, 0, 0])
-    kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(sharper))
+    kept = lobe_energy(light.sharpness) / lobe_energy(np.exp(sharper))
     other = msgspec.structs.replace(light, log_sharpness=sharper, weight=light.weight * kept[:, None])
     first, second = (fix_gauge(Point(MATERIALS, [li]), [data]) for li in (light, other))
     np.testing.assert_allclose(first.materials.vector(), second.materials.vector(), rtol=1e-12)
@@ -119,7 +119,7 @@ def test_a_single_light_comes_out_grey_and_a_lobe_made_sharper_at_its_energy_mov
 
 
 def test_a_sample_has_of_every_material_and_region_of_the_light_its_share():
-    data = block("room1", random_light(np.random.default_rng(4), 3), MATERIALS, [0, 1, 2], OPERATOR, size=60)
+    data = sphere_block("room1", random_light(np.random.default_rng(4), 3), MATERIALS, [0, 1, 2], OPERATOR, size=60)
     data = msgspec.structs.replace(data, row=np.arange(len(data)))
     every = list(zip(data.held_out.tolist(), data.material.tolist(), data.clusters().tolist(), strict=True))
     for count in (1, 40, 900):
@@ -168,7 +168,7 @@ def bowl(albedo, depth=0.5, size=40, count=1024) -> Observations:
     radiance = np.full((len(n), 3), albedo * (1 - depth) / (1 - albedo * depth))
     how = {
         "visibility": np.where(hidden, 0, 255).astype(np.uint8),
-        "met": np.where(hidden, codes, NO_OCCLUDER).astype(np.uint16),
+        "occluder": np.where(hidden, codes, NO_OCCLUDER).astype(np.uint16),
     }
     return observations_from_front(n, radiance, np.zeros(len(n), int), ("white",), **how)
 
@@ -186,7 +186,7 @@ def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
 def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own_unit_alike():
     seen, factor = bowl(0.5, size=20, count=256), 1e4
     open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
-    for none in (open_, msgspec.structs.replace(seen, met=None)):
+    for none in (open_, msgspec.structs.replace(seen, occluder=None)):
         assert blocks_of_observations(none, Noise())[0].bounced is None
     brighter = msgspec.structs.replace(seen, radiance=factor * seen.radiance)
     sent, more = (bounced_light(photo, photo.radiance) for photo in (seen, brighter))
@@ -234,7 +234,7 @@ def test_a_smooth_light_stays_when_cells_split_and_when_theirs_split_again(share
     twice = once.split(once.sharpness > light.sharpness.max())
     for one, more in ((once, 3), (twice, 15)):
         assert len(one) == pytest.approx(200 + more * some.sum(), rel=0.05)
-    spheres = block("room", light, MATERIALS, [0, 1, 2], NETWORK, size=14)
+    spheres = sphere_block("room", light, MATERIALS, [0, 1, 2], NETWORK, size=14)
     before = Illumination(spheres, light, MATERIALS, NETWORK).radiance()
     rough = MATERIALS.roughness[spheres.material] > 0.3
     for one, ripple in ((once, 0.04), (twice, 0.06)):

@@ -45,7 +45,7 @@ def lamps():
 def test_around_a_lamp_cells_split_and_what_they_hid_of_roughness_comes_out(lamps):
     problem, before, after = lamps
     (evidence,) = after.splitting
-    assert evidence.kept and evidence.log_bayes_factor > VERY_STRONG
+    assert evidence.accepted and evidence.log_bayes_factor > VERY_STRONG
     errors = [np.abs(state.fit.point.materials.roughness - MATERIALS.roughness)[SHOWN] for state in (before, after)]
     assert errors[1].sum() < 0.6 * errors[0].sum() and (errors[1] < errors[0]).all(), errors
     assert [len(light) for light in after.fit.point.lights] == pytest.approx([CELLS + 3 * SPLIT_CELLS] * 2, rel=0.1)
@@ -61,7 +61,7 @@ def test_each_light_splits_by_its_own_evidence():
 def test_a_constant_light_needs_no_finer_cells():
     problem, before = fitted([CONSTANT])
     after = split(problem, before)
-    assert [decision.kept for decision in after.splitting] == [False]
+    assert [decision.accepted for decision in after.splitting] == [False]
     assert after.fit is before.fit and after.observations == before.observations
 
 
@@ -75,7 +75,7 @@ def test_where_observations_are_explained_closely_more_of_them_are_fitted(lamps,
 def test_evidence_needs_no_held_out_observations(lamps):
     problem, before, _ = lamps
     nothing_held_out = problem.with_blocks([none_held_out(block) for block in problem.blocks])
-    assert split(nothing_held_out, before).splitting[0].kept
+    assert split(nothing_held_out, before).splitting[0].accepted
 
 
 def test_nothing_splits_if_no_splitting_is_allowed(lamps):

@@ -25,8 +25,8 @@ from factorlib.inference.start import (
     with_earlier_decisions,
 )
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
-from factorlib.results.solution import Earlier
-from factorlib.scenes.joint_problems import MATERIALS, block, factor_between, random_light
+from factorlib.results.solution import EarlierSolution
+from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block
 from factorlib.stage import serial_map
 from tests.inference.made_lights import FEW, OPERATOR, drawn, natural, on_even_cells, spheres
 
@@ -50,15 +50,15 @@ def first(materials: Materials, count: int) -> Materials:
     return Materials.from_rows(materials.rows()[:count])
 
 
-def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0)) -> Earlier:
-    """As the stage writes it and `read_earlier` reads it."""
+def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0)) -> EarlierSolution:
+    """As the stage writes it and `read_earlier_solution` reads it."""
     rows = materials.rows().tolist()
     solved = {name: Reflectance(tuple(r[:3]), tuple(r[3:6]), r[6]) for name, r in zip(names, rows, strict=True)}
     table = MaterialTable(solved, Gauge(component=dict(zip(names, component, strict=True))), Model())
     pairs = list(zip(blocks, lights, strict=True))
-    lobes = {b.name: li.lobes.scaled(b.unit) for b, li in pairs}
+    lobes = {b.name: li.lobes.scale(b.unit) for b, li in pairs}
     photos = [pair for b, li in pairs for pair in zip(b.photos, li.log_exposure, strict=True)]
-    return Earlier(table, lobes, {photo: (float(np.exp(e)),) * 3 for photo, e in photos})
+    return EarlierSolution(table, lobes, {photo: (float(np.exp(e)),) * 3 for photo, e in photos})
 
 
 def start_from(earlier, blocks, names=NAMES):
@@ -129,7 +129,7 @@ def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
     new, *others = blocks[0].photos
     factor = earlier.exposures[others[0]][0]
     relative = {photo: tuple(np.array(earlier.exposures[photo]) / factor) for photo in others}
-    lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was without `new`
+    lobes = {name: light.scale(factor) for name, light in earlier.lights.items()}  # as it was without `new`
     earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
     materials, (light,) = start_from(earlier, blocks)
     np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
@@ -161,7 +161,7 @@ def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kep
     losses = {"held_out_loss_with": 1.0} | ({"held_out_loss_without": 2.0, "margin": 3.0} if tried else {})
     chosen = {"self_shadowing_chosen_by": losses, "interreflection_chosen_by": losses}
     model = Model(self_shadowing=kept, interreflection=not kept, **chosen)
-    earlier = Earlier(MaterialTable({}, Gauge(), model), {}, {})
+    earlier = EarlierSolution(MaterialTable({}, Gauge(), model), {}, {})
     found, names = with_earlier_decisions(SolveOptions(), earlier), ["off", "on"]
     expected = [names[kept], names[not kept]] if tried else ["auto", "auto"]
     assert [found.self_shadowing, found.interreflection] == expected
@@ -226,7 +226,7 @@ def blocks():
     """Two lights with two photos each, some of which is hidden, and some sent by other surfaces, as is made up."""
     rng, directions = np.random.default_rng(4), np.stack([fibonacci_sphere(96)] * 2)
     lights = [random_light(rng, 2, photos=2) for _ in range(2)]
-    made = [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size=6) for i, li in enumerate(lights)]
+    made = [sphere_block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size=6) for i, li in enumerate(lights)]
     seen = [(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8) for b in made]
     hidden = [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, seen)]
     bounced = [msgspec.structs.replace(b, bounced=0.01 * rng.random((len(b), 6))) for b in hidden]

@@ -12,7 +12,7 @@ from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.lights import UnitLobes
 from factorlib.inference.model_selection import CLEARLY_AGAINST
 from factorlib.inference.suns import WIDE_SHARPNESS, accept_sun, compare_illuminations, replace_brightest, select_suns
-from factorlib.light.lobes import SUN, lobe_integral
+from factorlib.light.lobes import SUN, lobe_energy
 from factorlib.results.materials import Decision
 from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells, spheres
@@ -29,11 +29,11 @@ def solved(irradiance: float, seed: int):
     """Spheres under a sky drawn from the prior and a sun; the true irradiance by the sun in the blocks' unit; and the illumination and the fit
     that a solve without suns ends with, materials as they are."""
     sky = on_even_cells(drawn(seed, FEW))
-    energy = irradiance * sky.energy.sum(0) / lobe_integral(np.array([SUN]))
+    energy = irradiance * sky.energy.sum(0) / lobe_energy(np.array([SUN]))
     problem = spheres([(sky.with_lobes(SUN_LOBE, energy) if irradiance else sky)], size=24, seed=seed)
     fit = fit_problem(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
     (one,) = problem.illuminations(fit.point)
-    return problem, energy * lobe_integral(np.array([SUN])) / problem.blocks[0].unit, one, fit
+    return problem, energy * lobe_energy(np.array([SUN])) / problem.blocks[0].unit, one, fit
 
 
 def tried(irradiance: float, seed: int):
@@ -50,7 +50,7 @@ def tried(irradiance: float, seed: int):
 def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     cells, sun, wide = tried(0.5, seed)
     light, irradiance = sun.light, solved(0.5, seed)[1]
-    assert accept_sun(cells, sun).kept and compare_illuminations(wide, sun, CLEARLY_AGAINST).kept
+    assert accept_sun(cells, sun).accepted and compare_illuminations(wide, sun, CLEARLY_AGAINST).accepted
     assert light.suns.sum() == 1 and np.arccos(light.axis[light.suns][0] @ TOWARDS) < cells.light.spacing[0] / 4
     np.testing.assert_allclose(light.energy[light.suns][0], irradiance, rtol=0.3)
 
@@ -58,18 +58,18 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_no_sun_is_found_in_a_sky_without_one(seed):
     cells, sun, wide = tried(0.0, seed)
-    assert not (accept_sun(cells, sun).kept and compare_illuminations(wide, sun, CLEARLY_AGAINST).kept)
+    assert not (accept_sun(cells, sun).accepted and compare_illuminations(wide, sun, CLEARLY_AGAINST).accepted)
 
 
 def test_the_solve_keeps_suns_of_lights_that_have_one():
     problem, *_, fit = solved(0.5, 1)
     found = select_suns(problem, fit, FitRunner())
-    assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
+    assert found.evidence[0].accepted and found.fit.point.lights[0].suns.any()
     again = select_suns(problem, found.fit, FitRunner())
-    assert again.fit is found.fit and again.evidence[0].kept
+    assert again.fit is found.fit and again.evidence[0].accepted
     cloudy, *_, fit = solved(0.0, 1)
     none = select_suns(cloudy, fit, FitRunner())
-    assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
+    assert not none.evidence[0].accepted and none.fit.point.lights[0] is fit.point.lights[0]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share,
     """Whatever the observations say."""
     monkeypatch.setattr(suns, "compare_illuminations", lambda *_: Decision(True, 1.0, 2.0, 9.0))
     one = solved(0.0, 1)[2]
-    total = one.light.energy.sum() / lobe_integral(np.array([SUN]))[0]
+    total = one.light.energy.sum() / lobe_energy(np.array([SUN]))[0]
     weight = total * share * np.array(colour) / sum(colour)
     lit = msgspec.structs.replace(one, light=one.light.with_lobes(SUN_LOBE, weight))
-    assert accept_sun(one, lit).kept == kept
+    assert accept_sun(one, lit).accepted == kept

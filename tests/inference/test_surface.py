@@ -20,17 +20,17 @@ from factorlib.inference.surface_turns import (
     LARGEST_TURN,
     LEAST_VIEW_COSINE,
     PULL_SHARE,
-    Attached,
     Detail,
     Stiffness,
+    SurfacePositions,
     Surfaces,
     attach_pixels,
     linearise_light,
     solve_detail,
 )
-from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
-from factorlib.results.poses import ObjectPose, entry_of
+from factorlib.results.poses import ObjectPose, pose_fields
 from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, light_of, on_even_cells, photographed, spheres
@@ -49,14 +49,16 @@ def surfaces(subdivisions: int = 3) -> Surfaces:
     )
 
 
-def attached_to(normal: np.ndarray, body: Surfaces) -> Attached:
+def attached_to(normal: np.ndarray, body: Surfaces) -> SurfacePositions:
     """Points of the ball by their normals: at each the nearest triangle, whose corners count by their nearness."""
     (one,) = body.meshes.values()
     place, rotation = np.zeros((one.nodes, 3)), TURN
     place[one.node] = one.mesh.vertices
     face = ((normal @ rotation) @ place[one.faces].mean(1).T).argmax(1)
     share = np.exp(30 * (np.einsum("nd,nkd->nk", normal @ rotation, place[one.faces[face]]) - 1))
-    return Attached(one.faces[face], share / share.sum(1, keepdims=True), np.tile(rotation, (len(normal), 1, 1)))
+    return SurfacePositions(
+        one.faces[face], share / share.sum(1, keepdims=True), np.tile(rotation, (len(normal), 1, 1))
+    )
 
 
 def wrong(normal: np.ndarray, size: float) -> np.ndarray:
@@ -177,7 +179,7 @@ def errors(normals: np.ndarray, true: np.ndarray) -> float:
 
 def test_dents_that_the_object_has_not_are_found_in_three_lights():
     what, body, given, true = on_spheres(3, 0.15, 1)
-    assert what.evidence.kept and sum(what.gains.values()) > 0 and not what.painted.kept
+    assert what.evidence.accepted and sum(what.gains.values()) > 0 and not what.painted.accepted
     turn = body.turns_from_displacements(what.displacements)
     for block, exact in zip(given.blocks, true.blocks, strict=True):
         at = attached_to(exact.normal, body)
@@ -200,7 +202,7 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
         own = attached_to(block.normal, surfaces())
         at.append(msgspec.structs.replace(own, node=own.node + one.nodes * exact[:, None]))
     what = estimate_surface(problem.with_blocks(given), body, at, start_from_photos(3))
-    assert what.evidence.kept and set(what.displacements) == {"dented"}
+    assert what.evidence.accepted and set(what.displacements) == {"dented"}
     turn = body.turns_from_displacements(what.displacements)
     assert turn[body.node_mask({"dented"})].any() and not turn[body.node_mask({"exact"})].any()
     for block, shown, own in zip(problem.blocks, given, at, strict=True):
@@ -228,7 +230,7 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
         for b, x, y in zip(problem.blocks, plain, shown, strict=True)
     ]
     what = estimate_surface(problem.with_blocks(blocks), body, at, start_from_photos(3))
-    assert what.painted.kept
+    assert what.painted.accepted
     seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
     assert np.corrcoef(what.log_factors["ball"][seen], log_factor[seen])[0, 1] > 0.8
 
@@ -249,7 +251,7 @@ def test_an_exact_surface_stays_in_sharp_lights(lights, shown, seed):
     problem, body = spheres([sharp(10 * seed + k) for k in range(lights)], shown=shown, size=22, noise=0.1), surfaces()
     at = [attached_to(block.normal, body) for block in problem.blocks]
     what = estimate_surface(problem, body, at, start_from_photos(3))
-    assert not what.evidence.kept and not what.displacements
+    assert not what.evidence.accepted and not what.displacements
 
 
 # ── Nodes under pixels: they are where the pixel's ray meets the mesh, in the frame of the object's pose, whichever s
@@ -266,7 +268,7 @@ def ball(offset=0.0) -> Mesh:
 
 def entry(pose: Pose, scale=(1.0, 1.0, 1.0)) -> ObjectPose:
     """An entry of poses.json."""
-    return ObjectPose(**entry_of(pose), scale=scale)
+    return ObjectPose(**pose_fields(pose), scale=scale)
 
 
 def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
@@ -275,7 +277,7 @@ def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
     turns = [turn * np.sign(np.linalg.det(turn)) for turn in turns]
     poses = [Pose(turns[0], np.array([-1.2, 0, 5.0])), Pose(turns[1], np.array([1.3, 0.2, 6.0]))]
     meshes, scale = {"apple": ball(), "pear": ball(0.3)}, (1.0, 1.2, 0.8)
-    maps = rasterise([meshes["apple"], scaled(meshes["pear"], scale)], CAMERA, poses)
+    maps = rasterise([meshes["apple"], scale_mesh(meshes["pear"], scale)], CAMERA, poses)
     surfaces = Surfaces({name: subdivided_mesh(mesh) for name, mesh in meshes.items()})
     objects = {"a": ("apple", entry(poses[0])), "b": ("pear", entry(poses[1], scale))}
     y, x = np.nonzero(maps.object >= 0)

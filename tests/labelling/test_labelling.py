@@ -17,7 +17,7 @@ from PIL import Image
 from factorlib.labelling.server import MaskSet, Server
 from factorlib.labels.mask_files import read_values
 from tests.browser import CHROMIUM, started
-from tests.labels.test_labels import scene
+from tests.labels.test_label_image import scene
 from tests.refusal import refusal
 
 ROOT = Path(__file__).resolve().parents[2]

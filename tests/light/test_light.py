@@ -10,7 +10,7 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.latlong import lat_long_of_lobes, map_energy, sample_map
-from factorlib.light.lobes import Lobes, lobe_integral, no_lobes
+from factorlib.light.lobes import Lobes, lobe_energy, no_lobes
 from factorlib.light.prior import MIX, LightPrior, read_light_prior
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
 from factorlib.results.lobe_table import read_lobes, write_lobes
@@ -29,7 +29,7 @@ def some_lobes(count: int = 6, seed: int = 0) -> Lobes:
 @pytest.mark.parametrize("sharpness", [1e-6, 5e-4, 2e-3, 0.1, 3.0, 500.0])
 def test_integral_is_the_quadrature_over_the_cosine(sharpness):
     expected = 2 * np.pi * quad(lambda t: np.exp(sharpness * (t - 1)), -1, 1)[0]
-    assert lobe_integral(sharpness) == pytest.approx(expected, rel=1e-9)
+    assert lobe_energy(sharpness) == pytest.approx(expected, rel=1e-9)
 
 
 def test_table_round_trip_is_exact_and_byte_equal(tmp_path):
@@ -165,7 +165,7 @@ def test_texels_are_means_of_much_finer_point_samples(axis):
     light, height, finer = lobe(axis, 400.0), 8, 128
     weight = lat_long_solid_angles(height * finer, 2 * height * finer)
     directions = lat_long_directions(height * finer, 2 * height * finer).reshape(-1, 3)
-    point = light.turned(YUP_FROM_CAMERA).radiance(directions).reshape(height, finer, 2 * height, finer, 3)
+    point = light.rotate(YUP_FROM_CAMERA).radiance(directions).reshape(height, finer, 2 * height, finer, 3)
     expected = (
         np.einsum("ha,hawbc->hwc", weight.reshape(height, finer), point)
         / finer

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from factorlib.meshes.mesh import Mesh, area_vectors, consistently_wound, corner_normals
+from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipped_faces
 from factorlib.meshes.ply_stl_off import submesh, write_ply
-from factorlib.meshes.read import merged_normals, read_mesh, usable
+from factorlib.meshes.read_mesh import merged_normals, read_mesh, usable
 from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
 from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals
 from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put
@@ -209,7 +209,7 @@ def test_flipped_faces_are_turned_back_unless_most_of_an_open_patch_is():
         mesh = usable_mesh(ball.vertices, flipped)
         assert np.sum(mesh.normals * mesh.vertices, axis=1).min() > 0.99
     bowl = ball.faces[ball.triangles_center[:, 2] > 0][:, ::-1]  # inward, on purpose
-    flip, is_open = consistently_wound(ball.vertices, bowl)
+    flip, is_open = find_flipped_faces(ball.vertices, bowl)
     assert is_open and not flip.any()
 
 
@@ -277,7 +277,7 @@ def smooth(body: SubdividedMesh, size: float) -> np.ndarray:
 def test_a_displacement_is_found_from_the_turns_that_it_means():
     body = subdivided_mesh(ball(3))
     true = smooth(body, 0.02)
-    found = body.displacement(body.turn_of(true), np.ones(body.nodes))
+    found = body.displacement(body.normal_change(true), np.ones(body.nodes))
     assert np.std(found - found.mean() - true) < 0.05 * np.std(true)
 
 
@@ -288,7 +288,7 @@ def test_a_ball_that_was_given_as_an_ellipsoid_gets_its_normals_back():
     true /= np.linalg.norm(true, axis=1, keepdims=True)
     turn = np.zeros((body.nodes, 3))
     turn[body.node] = true - body.mesh.normals
-    moved = body.moved(body.displacement(turn, np.ones(body.nodes)))
+    moved = body.displace(body.displacement(turn, np.ones(body.nodes)))
     before, after = (
         np.degrees(np.arccos(np.clip(np.sum(n * true, 1), -1, 1))) for n in (body.mesh.normals, moved.normals)
     )

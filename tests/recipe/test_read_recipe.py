@@ -5,11 +5,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.jsonfile import write_json
 from factorlib.recipe.kinds import KINDS, InsertRecipe, recipe_of
-from factorlib.recipe.read import files_of, read_recipe
-from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
+from factorlib.recipe.read_recipe import files_of, read_recipe
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
 from tests.refusal import refusal
@@ -78,7 +78,7 @@ def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):
 
 def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tmp_path):
     (tmp_path / "bunny.obj").write_text("")
-    one = solved(Reflectance((0.1,) * 3, (0.5,) * 3, 0.2), StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0))
+    one = attach_errors(Reflectance((0.1,) * 3, (0.5,) * 3, 0.2), StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0))
     write_json(tmp_path / "own.json", MaterialTable({"gold": one}))
     path = written(tmp_path, "kind: insert\nmesh: bunny.obj\nmaterial: gold\ntable: own.json")
     recipe = read_recipe(path, dataset)
@@ -87,7 +87,7 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
 
 
 def test_a_denoiser_that_is_not_installed_is_refused_with_the_cure(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("factorlib.recipe.read.find_spec", lambda name: None)
+    monkeypatch.setattr("factorlib.recipe.read_recipe.find_spec", lambda name: None)
     error = refusal(r"denoise.*not installed", read_recipe, written(tmp_path, "kind: view\ndenoise: true"), dataset)
     assert "make setup EXTRAS=denoise" in str(error)
     assert not read_recipe(written(tmp_path, "kind: view\ndenoise: false"), dataset).denoise

@@ -12,7 +12,7 @@ from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, on_floor, resting_plane
-from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compared_shadow, inserted, shadow_match
+from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compare_shadow, insert_object, shadow_match
 from factorlib.render.photo_scene import (
     ALL_BOUNCES,
     Orbit,
@@ -20,15 +20,15 @@ from factorlib.render.photo_scene import (
     PlacedMesh,
     light_entries,
     lit_ball,
+    rotate_light,
     shapes,
     traced_photo,
-    turned_light,
     with_sun,
 )
-from factorlib.render.placement import STEP, Spot, free_placement, spot_at, spot_beside, standing_mesh
+from factorlib.render.placement import STEP, Spot, free_placement, spot_beside, standing_mesh, unproject_spot
 from factorlib.results.materials import Reflectance
 from factorlib.tracing import scene as tracing
-from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
+from factorlib.tracing.scene import bsdf, render_scene, rigid, sensor, transform
 from tests.refusal import refusal
 
 SMALL = Camera(48, 40, 60.0, (26.0, 18.0))
@@ -84,7 +84,7 @@ def test_turning_camera_objects_and_light_together_changes_nothing(pair):
     """About the upright axis through the camera."""
     whole = rigid(about((0, 1, 0), 50), np.zeros(3))
     objects = [msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in pair.objects]
-    other = msgspec.structs.replace(pair, objects=tuple(objects), light=turned_light(pair.light, 50))
+    other = msgspec.structs.replace(pair, objects=tuple(objects), light=rotate_light(pair.light, 50))
     assert (
         differ(
             traced_photo(pair, 256),
@@ -97,8 +97,8 @@ def test_turning_camera_objects_and_light_together_changes_nothing(pair):
 @pytest.mark.parametrize("angle", [0, 70])
 def test_lobes_and_their_map_are_the_same_light(pair, angle):
     """Also turned: the map's axes are the world's, the lobes' the camera's."""
-    as_map = msgspec.structs.replace(pair, light=turned_light(lat_long_of_lobes(pair.light, 64, 128), angle))
-    as_lobes = msgspec.structs.replace(pair, light=turned_light(pair.light, angle))
+    as_map = msgspec.structs.replace(pair, light=rotate_light(lat_long_of_lobes(pair.light, 64, 128), angle))
+    as_lobes = msgspec.structs.replace(pair, light=rotate_light(pair.light, angle))
     assert differ(traced_photo(as_lobes, 256), traced_photo(as_map, 256)) < 0.02
 
 
@@ -132,7 +132,7 @@ def test_an_assumed_sun_takes_its_share_of_the_energy_from_the_rest_and_from_oth
 def test_a_sun_lights_a_ball_as_its_irradiance_says_and_stands_where_its_axis_says(size):
     """k_d/π · E · cos, as a disc beyond the scene and as a lobe of the map; its shadow is as sharp as it is wide."""
     dark = Lobes(AXIS[None], np.ones(1), np.full((1, 3), 1e-6))
-    light = with_sun(dark, AXIS, size, 1.0).scaled(1e6)
+    light = with_sun(dark, AXIS, size, 1.0).scale(1e6)
     ball = lit_ball(light, COLOURS["grey"], 64, 256)[..., 0]
     row, column = np.unravel_index(ball.argmax(), ball.shape)  # the camera sees x right and y down of the light's axes
     assert abs(column + 0.5 - 32 * (1 + 0.6)) < 4 and abs(row + 0.5 - 32 * (1 - 0.48)) < 4
@@ -153,10 +153,10 @@ def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(pa
 
 def test_a_pixel_names_the_spot_that_it_shows(pair):
     plane = Plane(np.array([0, 1.0, 0]), np.array([0, -0.7, -6]))
-    spot = spot_at(pair, plane, pair.objects[0], (30.5, 33.0), 0.5)
+    spot = unproject_spot(pair, plane, pair.objects[0], (30.5, 33.0), 0.5)
     ray = SMALL.rays_through(np.array([[30.5, 33.0]]))[0] * [1, -1, -1]
     assert np.allclose(np.cross(spot.point, ray), 0, atol=1e-9) and spot.point[1] == pytest.approx(-0.7)
-    refusal("above the horizon", spot_at, pair, plane, pair.objects[0], (30.5, 3.0), 0.5)
+    refusal("above the horizon", unproject_spot, pair, plane, pair.objects[0], (30.5, 3.0), 0.5)
 
 
 # ── A floor takes the shadow of what stands on it, fades out, and changes nothing else ──────────────────────────────
@@ -228,7 +228,7 @@ def true_photo(objects, samples=1024):
         frame = rigid(np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (k + 0.5, -1.0, -6))
         stripe = {"type": "rectangle", "to_world": transform(frame)}
         entries[f"stripe{k + 8}"] = stripe | {"bsdf": bsdf(Reflectance((STRIPES[k % 2],) * 3, (0.0,) * 3, 1.0))}
-    return rendered(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
+    return render_scene(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
 
 
 def new(material="red") -> PlacedMesh:
@@ -238,11 +238,11 @@ def new(material="red") -> PlacedMesh:
 @pytest.fixture(scope="module")
 def made():
     photo = true_photo([THERE])
-    return photo, inserted(stands(SCENE), photo, OPEN, 512)
+    return photo, insert_object(stands(SCENE), photo, OPEN, 512)
 
 
 def match_of(scene, photo):
-    return compared_shadow(stands(scene), inserted(stands(scene), photo, OPEN, 64), photo, OPEN, 64)
+    return compare_shadow(stands(scene), insert_object(stands(scene), photo, OPEN, 64), photo, OPEN, 64)
 
 
 def blocks(picture):
@@ -263,10 +263,10 @@ def test_the_composite_is_the_photo_of_the_scene_with_the_object(made):
 
 def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_object_and_only_there(made):
     photo, found = made
-    brighter = PhotoScene(CAMERA, (THERE,), light().scaled(2.0), MATERIALS)
+    brighter = PhotoScene(CAMERA, (THERE,), light().scale(2.0), MATERIALS)
     polish = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
-    matt, polished = (inserted(stands(SCENE, polish=p), photo, OPEN, 64) for p in (None, polish))
-    again = inserted(stands(brighter), 2 * photo, OPEN, 64)
+    matt, polished = (insert_object(stands(SCENE, polish=p), photo, OPEN, 64) for p in (None, polish))
+    again = insert_object(stands(brighter), 2 * photo, OPEN, 64)
     assert np.allclose(again.composite, 2 * matt.composite, rtol=1e-4, atol=1e-6)
     difference = np.abs(polished.composite - matt.composite).max(axis=-1)
     rows, columns = np.nonzero(found.coverage > 0)
@@ -288,7 +288,7 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
         scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
         placed = standing_mesh(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
         photo = np.ones((CAMERA.height, CAMERA.width, 3))
-        seen.append(inserted(stands(scene, placed), photo, OPEN, 16).coverage.sum())
+        seen.append(insert_object(stands(scene, placed), photo, OPEN, 16).coverage.sum())
     assert seen[0] > 100 and seen[1] < 0.9 * seen[0]
 
 
@@ -307,7 +307,7 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
     assert shadow_match(np.where(where[..., None], lit, 0.5), lit, constant, where).correlation == pytest.approx(1)
     assert shadow_match(lit, np.ones_like(lit), constant, where).correlation is None
 
-    plain = rendered(
+    plain = render_scene(
         {**light_entries(light(), 6.0), **shapes([THERE], MATERIALS), "ground": floor()},
         sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), 128, 7, ALL_BOUNCES,
     )  # fmt: skip
@@ -343,7 +343,7 @@ def stand(spot: Spot) -> PlacedMesh:
 
 def test_a_ball_in_a_ball_moves_until_they_touch_and_stays_there():
     there, spot = at(sphere(0.5), (0.3, -0.5, -6.2)), Spot(LOW, np.array([0.2, -1.0, -6.0]), 0.6)
-    new, moved, words = free_placement(scene_of(there), stand, spot, asked=True, factor=2)
+    new, moved, words = free_placement(scene_of(there), stand, spot, is_requested=True, factor=2)
     between = np.linalg.norm(new.vertices.mean(axis=0) - there.vertices.mean(axis=0))
     assert 0.795 < between < 0.8 + 1.5 * STEP * 0.6  # of radii .5 and .3
     far = np.linalg.norm(moved.point - spot.point)
@@ -353,13 +353,13 @@ def test_a_ball_in_a_ball_moves_until_they_touch_and_stays_there():
     assert words == (
         f"The new object was moved by {far / 0.6:.1f} of its heights, to `at: [{x:.0f}, {y:.0f}]`, because it would intersect 'there'."
     )
-    again, same, words = free_placement(scene_of(there), stand, moved, asked=True)
+    again, same, words = free_placement(scene_of(there), stand, moved, is_requested=True)
     assert words == "" and same is moved and np.array_equal(again.vertices, new.vertices)
 
 
 def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
     spot = Spot(LOW, np.array([-0.9, -1.0, -6.0]), 1.2)
-    new, there, words = free_placement(scene_of(at(sphere(1.0), (0.9, 0, -6.5))), stand, spot, asked=False)
+    new, there, words = free_placement(scene_of(at(sphere(1.0), (0.9, 0, -6.5))), stand, spot, is_requested=False)
     assert words == "" and there is spot and new.vertices[:, 1].min() == pytest.approx(-1.0)
 
 
@@ -375,12 +375,12 @@ CASES = [
 @pytest.mark.parametrize("other, point, words, cure", CASES)
 def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked(other, point, words, cure):
     spot = Spot(LOW, np.array(point), 0.8)
-    error = refusal(words, free_placement, scene_of(other), stand, spot, asked=True)
+    error = refusal(words, free_placement, scene_of(other), stand, spot, is_requested=True)
     assert error.key == "at" and cure in error.cure
-    new, there, said = free_placement(scene_of(other), stand, spot, asked=False)
+    new, there, said = free_placement(scene_of(other), stand, spot, is_requested=False)
     assert words in said
     x, y = (int(v) for v in error.cure.split("[")[1].split("]")[0].split(","))
-    named = spot_at(scene_of(other), LOW, new, (x, y), 1.0)  # the place that is named is where it is moved to
+    named = unproject_spot(scene_of(other), LOW, new, (x, y), 1.0)  # the place that is named is where it is moved to
     assert np.linalg.norm(named.point - there.point) < 0.25
 
 
@@ -394,7 +394,7 @@ def test_an_object_that_fits_nowhere_is_refused_with_a_size_that_does():
         scene_of(at(sphere(0.3), (0, 0, -5.7))),
         stand,
         spot,
-        asked=False,
+        is_requested=False,
     )
     assert error.key == "size" and "of its size it fits at `at: [" in error.cure
 
@@ -413,6 +413,6 @@ def smooth_light(height):
 def test_the_light_seen_is_the_light_there():
     """A map, seen from inside by six cameras in a turned frame, comes back as that map turned."""
     light = smooth_light(16)
-    turn = tracing.look(20, 130) @ YUP_FROM_CAMERA
+    turn = tracing.look_rotation(20, 130) @ YUP_FROM_CAMERA
     seen = tracing.incident_light({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
     assert seen == pytest.approx(sample_map(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)

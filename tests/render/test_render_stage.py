@@ -15,7 +15,7 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
-from factorlib.render.resynthesis import PointEffects, Reflector, balls
+from factorlib.render.resynthesis import PointEffects, Reflector, render_balls
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import silent
@@ -103,7 +103,7 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     )  # the lower half is hidden, by nothing known
     normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     columns = {"view": view, "x": x, "y": y, "visibility": np.tile(visibility, (n, 1))}
-    columns |= {"met": np.full((n, 64), NO_OCCLUDER, np.uint16)}
+    columns |= {"occluder": np.full((n, 64), NO_OCCLUDER, np.uint16)}
     radiance, names = np.full((n, 3), 0.3), tuple(made_export.NAMES)
     seen = observations_from_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
     (tmp_path / "urm").mkdir()
@@ -177,7 +177,7 @@ def test_radiance_is_the_integral_over_the_exported_map():
 def test_balls_are_the_operator_at_every_pixel(roughness, sharpest):
     glossy = msgspec.structs.replace(GLOSSY, roughness=roughness)
     reflector = Reflector(reflection_operator("network"), cells(sharpest))
-    for picture in balls(reflector, glossy, (96, 48)):
+    for picture in render_balls(reflector, glossy, (96, 48)):
         normals, inside = ball_normals(len(picture))
         normals = normals * (1, -1, -1)
         expected = reflector(glossy, normals, np.broadcast_to(FRONT, normals.shape))
@@ -196,7 +196,7 @@ def test_chunks_do_not_show(monkeypatch):
     assert seen[0] == (7, 50) and seen[-1] == (50, 50)
 
 
-@pytest.mark.parametrize("lit, facing", [(no_lobes(), 1), (light().scaled(0.0), 1), (light(), -1)])
+@pytest.mark.parametrize("lit, facing", [(no_lobes(), 1), (light().scale(0.0), 1), (light(), -1)])
 def test_darkness_is_black_and_so_is_what_faces_away(lit, facing):
     normals, views = points(20)
     assert not Reflector(reflection_operator("closed_form"), lit)(GLOSSY, normals, facing * views).any()

@@ -16,9 +16,9 @@ from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
 from factorlib.report.comparison import comparison
-from factorlib.report.pictures import reduced
+from factorlib.report.pictures import downsample
 from factorlib.results.lobe_table import write_lobes
-from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved
+from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.results.photos import PhotoFacts
 from factorlib.runner import verbs
 from factorlib.runner.project import Project, Provider
@@ -195,7 +195,9 @@ EVIL = "<script>alert(1)</script>"
 
 
 def material(factor=1.0, roughness=0.3):
-    return solved(Reflectance((0.3 * factor, 0.2 * factor, 0.1 * factor), (0.05 * factor,) * 3, roughness), ERROR)
+    return attach_errors(
+        Reflectance((0.3 * factor, 0.2 * factor, 0.1 * factor), (0.05 * factor,) * 3, roughness), ERROR
+    )
 
 
 def result(folder, roughness=0.3, factor=1.0, light=1.0, names=("red", EVIL), photo="kitchen"):
@@ -308,7 +310,7 @@ def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
 @pytest.mark.parametrize("size", [(100, 60), (61, 97)])
 def test_reducing_keeps_the_mean_and_a_constant(size):
     picture = np.random.default_rng(2).uniform(size=(*size, 3)).astype(np.float32)
-    small = reduced(picture, 25)
+    small = downsample(picture, 25)
     assert max(small.shape[:2]) == 25 and small.mean() == pytest.approx(picture.mean(), rel=1e-4)
-    assert reduced(np.ones((*size, 1), np.float32), 25) == pytest.approx(np.ones((*small.shape[:2], 1)), rel=1e-5)
-    assert reduced(picture, 200) is picture
+    assert downsample(np.ones((*size, 1), np.float32), 25) == pytest.approx(np.ones((*small.shape[:2], 1)), rel=1e-5)
+    assert downsample(picture, 200) is picture

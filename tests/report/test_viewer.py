@@ -39,7 +39,7 @@ def artifacts(inputs) -> Artifacts:
 def viewed(inputs) -> dict:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
-    return viewer.viewed(artifacts(inputs), lights, objects, dict.fromkeys(LINKED, 1.0))
+    return viewer.viewer_data(artifacts(inputs), lights, objects, dict.fromkeys(LINKED, 1.0))
 
 
 # ── What is handed over ──────────────────────────────────────────────────────────────────────────────────────────────

@@ -12,10 +12,10 @@ from factorlib.results.materials import (
     Reflectance,
     StandardErrors,
     Tone,
-    in_order,
+    attach_errors,
     read_exposures,
     read_materials,
-    solved,
+    select_materials,
 )
 from factorlib.results.metrics import Counts, Metrics, ResynthesisErrors, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photo_facts
@@ -23,7 +23,7 @@ from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, read_ph
 from tests.refusal import refusal
 
 ERRORS = StandardErrors((0.01, 0.02, 0.03), (0.1, 0.1, 0.1), 0.05)
-RED = solved(Reflectance((0.5, 0.1, 0.1), (0.05, 0.05, 0.05), 0.3), ERRORS)
+RED = attach_errors(Reflectance((0.5, 0.1, 0.1), (0.05, 0.05, 0.05), 0.3), ERRORS)
 TABLE = MaterialTable({"red": RED}, Gauge("white light", {"red": 0}, "by hand"), Model(tone={"hall": Tone(1.2, 0.4)}))
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 HALL = PhotoPoses(CameraEntry(300.0, (8.0, 6.0)), {"vase": ObjectPose(EYE, (0.0, 0.0, 2.0), source="found")})
@@ -71,8 +71,8 @@ def test_what_does_not_fit_is_named_by_its_key(tmp_path, old, new, words, key):
 
 
 def test_a_missing_material_is_named(tmp_path):
-    assert in_order(TABLE, ["red"], tmp_path) == [RED]
-    refusal("'blue' is missing", in_order, TABLE, ["red", "blue"], tmp_path)
+    assert select_materials(TABLE, ["red"], tmp_path) == [RED]
+    refusal("'blue' is missing", select_materials, TABLE, ["red", "blue"], tmp_path)
 
 
 def test_a_mirrored_pose_is_refused(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import display, verbs
-from factorlib.runner.plan import Planned, Step
+from factorlib.runner.plan import PlannedStep, Step
 from factorlib.runner.results_folder import clean, collect
 from tests.faults.test_kills import start, wait_until
 from tests.runner import toy
@@ -214,7 +214,7 @@ def test_a_terminal_shows_a_bar_for_each_stage_and_lines_above_them(monkeypatch)
     terminal.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", terminal)
     shown = display.Display()
-    shown.plan([Planned(step, "to run", []) for step in steps])
+    shown.plan([PlannedStep(step, "to run", []) for step in steps])
     for step in steps:
         shown.start(step)
     shown.progress(steps[0], 1, 2, "half\x1b[31m")

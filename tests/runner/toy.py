@@ -14,7 +14,7 @@ import msgspec
 from factorlib import __main__ as command_line
 from factorlib.runner import verbs
 from factorlib.runner.dataset_state import Request, read_state
-from factorlib.runner.plan import Planned
+from factorlib.runner.plan import PlannedStep
 from factorlib.runner.project import LIBRARY, Data, Project, Provider, photo_sets
 
 LETTERS = '''
@@ -158,7 +158,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def planned(project: Project, dataset: str = "set", settings: tuple[str, ...] = ()) -> list[Planned]:
+def planned(project: Project, dataset: str = "set", settings: tuple[str, ...] = ()) -> list[PlannedStep]:
     return read_state(project, Request(dataset, settings=settings)).plan()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from factorlib.align.input_checks import check_before_camera
 from factorlib.align.search import SearchOptions
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.generate.folder import write_labels, write_photo
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector

@@ -12,7 +12,7 @@ from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
 from factorlib.recipe import kinds
 from factorlib.render.solved_set import SolvedSet
-from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.stage import Inputs, silent
 from stages import recipes
 from tests.export import made_export
@@ -74,7 +74,7 @@ def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(made, photo):
     """Also where that is fixed to the world: the map of the light with the sun is brightest in the direction that the recipe says."""
     results, sun = SolvedSet(made), kinds.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
     world = results.lights[photo].world_from_camera
-    own = results.scene(photo, sun).light.turned(YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)))
+    own = results.scene(photo, sun).light.rotate(YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)))
     directions = lat_long_directions(64, 128).reshape(-1, 3)
     brightest = directions[own.radiance(directions).sum(axis=1).argmax()]
     assert brightest @ np.array(sun.direction) / np.linalg.norm(sun.direction) > np.cos(np.radians(3))
@@ -98,7 +98,7 @@ def test_the_photo_stays_where_no_object_is(made, tmp_path):
 
 
 def own_material(made, tmp_path, material):
-    write_json(tmp_path / "own.json", MaterialTable({"own": solved(material, ERROR)}))
+    write_json(tmp_path / "own.json", MaterialTable({"own": attach_errors(material, ERROR)}))
     recipe = kinds.TransferRecipe(photos=["front"], materials={"red": "own"}, table="own.json", samples=4)
     drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
 

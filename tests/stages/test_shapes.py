@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read_dataset import read_dataset
 from factorlib.generate.folder import write_labels, write_photo
 from factorlib.generate.solids import SHAPES
 from factorlib.geometry.camera import Camera

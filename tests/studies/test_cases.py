@@ -6,15 +6,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.evaluate.ball import constant_light
+from factorlib.evaluate.ball import uniform_light
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
-from factorlib.results.materials import MaterialTable, StandardErrors, solved
+from factorlib.results.materials import MaterialTable, StandardErrors, attach_errors
 from factorlib.stage import Inputs, silent
 from studies.spheres import materials_of, observe_spheres
 from studies.steps import score, solve
 from studies.study import Case, Objects, World, full_matrix
 
-LIGHTS = {li: constant_light(np.array([1.0, 0.8, 0.5]) * (1 + li)) for li in range(3)}
+LIGHTS = {li: uniform_light(np.array([1.0, 0.8, 0.5]) * (1 + li)) for li in range(3)}
 RNG = np.random.default_rng(0)
 
 
@@ -88,7 +88,7 @@ def scored(case, factors, roughness=0.0):
             specular=tuple(true.specular * f),
             roughness=true.roughness + roughness,
         )
-        table[case.names[m]] = solved(of, StandardErrors((0.01,) * 3, (0.01,) * 3, 0.02))
+        table[case.names[m]] = attach_errors(of, StandardErrors((0.01,) * 3, (0.01,) * 3, 0.02))
     own = {li: MAPS[li] / of_light[li] for li in case.lights}
     return score.score_case(case, truths, MAPS, MaterialTable(table).materials, own)
 

@@ -11,9 +11,9 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import FileHashes
 from stages.solve import Params
-from studies.catalogue import methods
+from studies.catalogue import STUDIES, methods
 from studies.conclusion import MEASURES
-from studies.run import STUDIES, studies
+from studies.run import studies
 from studies.steps.parts import CHANGES
 from studies.study import FULL, QUICK, settings_of
 
@@ -55,7 +55,7 @@ def test_every_step_has_a_module_and_takes_what_was_made_before_it():
 
 
 def test_a_plan_of_studies_loads_no_science():
-    code = "import sys; from studies.run import STUDIES; from studies.study import FULL; [s.cases(FULL) for s in STUDIES.values()]"
+    code = "import sys; from studies.catalogue import STUDIES; from studies.study import FULL; [s.cases(FULL) for s in STUDIES.values()]"
     code += "; sys.exit(', '.join({'numpy', 'torch', 'scipy', 'OpenImageIO', 'PIL'} & set(sys.modules)) or 0)"
     assert subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, check=False).returncode == 0
 

@@ -4,9 +4,9 @@ import numpy as np
 
 from factorlib.conventions import lat_long_directions
 from studies.baselines import (
-    grey,
-    projective,
-    rendered,
+    predict_by_projection,
+    predict_by_rendering,
+    predict_grey,
 )
 from studies.catalogue import methods as comparison
 from studies.recovery_errors import in_gauge, scale_reflectance
@@ -55,16 +55,16 @@ def test_the_truth_in_any_gauge_scores_nothing_a_grey_ball_does_and_what_is_not_
 
     def true(truths, maps):
         materials = {n: scale_reflectance(truths[n], factor) for n in ("brick", "leaf")}
-        return rendered(*in_gauge(materials, {li: maps[li] / factor for li in (0, 1)}, truths))
+        return predict_by_rendering(*in_gauge(materials, {li: maps[li] / factor for li in (0, 1)}, truths))
 
     score, pictures = scores(true)
     assert {picture.target.kind for picture in pictures} == set(compare.KINDS)
     assert len({picture.target for picture in pictures}) == len(pictures) == 8 + 2 + 6
     measures = [kind + suffix for kind in compare.KINDS for suffix in compare.SUFFIXES.values()]
     assert max(score.values[m] for m in (*measures, "mirror")) < 1e-6 and score.values["roughness"] == 0
-    worse, _ = scores(lambda truths, maps: grey(photos(side=2, size=12), truths))
+    worse, _ = scores(lambda truths, maps: predict_grey(photos(side=2, size=12), truths))
     assert min(worse.values[m] for m in measures) > 0.02 and "roughness" not in worse.values
-    score, _ = scores(lambda truths, maps: projective(photos(side=2, size=12), {}))
+    score, _ = scores(lambda truths, maps: predict_by_projection(photos(side=2, size=12), {}))
     assert not {"diffuse", "mirror", "novel_material"} & score.values.keys() and "novel_view" in score.values
 
 

@@ -11,11 +11,11 @@ from scipy.optimize import approx_fprime
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import write_rgb_exr
-from factorlib.inference.priors import Classes
+from factorlib.inference.material_prior import Classes
 from factorlib.jsonfile import read_json
 from factorlib.light.prior import LightPrior, angles
 from studies.measured import light_prior, material_classes
-from studies.measured.light_prior import _cost, cell_means, fitted, log_cells, maps_in, mean_of, rounded
+from studies.measured.light_prior import _cost, cell_means, fit_prior, log_cells, maps_in, mean_of, round_numbers
 from tests.light.test_light import KNOWN
 
 
@@ -32,7 +32,7 @@ def drawn(prior: LightPrior, cells, count: int, seed: int = 0):
 
 def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
     cells = fibonacci_sphere(100)
-    found = fitted(drawn(KNOWN, cells, 150), cells)
+    found = fit_prior(drawn(KNOWN, cells, 150), cells)
     for name, rtol in (("variance", 0.25), ("decay_deg", 0.25), ("nugget", 0.3), ("level", 0.5), ("freedom", 0.4)):
         np.testing.assert_allclose(getattr(found, name), getattr(KNOWN, name), rtol=rtol)
     np.testing.assert_allclose(found.profile, KNOWN.profile, atol=0.15)
@@ -68,7 +68,7 @@ def test_the_table_says_what_it_was_made_from_and_how_good_it_is(tmp_path, monke
         write_rgb_exr(folder / f"{name}.exr", np.exp(logs))
     light_prior.main([folder], tmp_path / "table.json")
     prior = msgspec.convert(read_json(tmp_path / "table.json"), LightPrior)
-    assert [source.name for source in prior.made_from] == ["a.exr", "b.exr", "c.exr"] and prior == rounded(prior)
+    assert [source.name for source in prior.made_from] == ["a.exr", "b.exr", "c.exr"] and prior == round_numbers(prior)
     assert prior.made_from[0].sha256 == hashlib.sha256((folder / "a.exr").read_bytes()).hexdigest()
     assert prior.profile[0][0] > 0.5 and np.isfinite(prior.leave_one_out.prior)
     with pytest.raises(InputError, match="no .hdr or .exr"):

@@ -9,7 +9,7 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
-from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
 from studies.measured import gallery, results
 from studies.measured.eames_like import MAPS, link_maps, split_maps
 from studies.measured.standard_errors import light_deviations, material_deviations
@@ -57,8 +57,8 @@ def test_a_prior_is_fitted_to_the_maps_that_light_no_photo(tmp_path):
 def written(folder, roughness, scale, light, names=("one", "two")):
     """Two materials times a scale, and one light with a relative standard error of .1."""
     stderr = StandardErrors((0.02, 0.02, 0.02), (0.01, 0.01, 0.01), 0.05)
-    one = solved(Reflectance((0.4 * scale,) * 3, (0.1 * scale,) * 3, roughness), stderr)
-    two = solved(Reflectance((0.2 * scale,) * 3, (0.04 * scale,) * 3, 0.5), stderr)
+    one = attach_errors(Reflectance((0.4 * scale,) * 3, (0.1 * scale,) * 3, roughness), stderr)
+    two = attach_errors(Reflectance((0.2 * scale,) * 3, (0.04 * scale,) * 3, 0.5), stderr)
     for kind in ("illumination", "coverage"):
         (folder / "export" / kind).mkdir(parents=True)
     write_json(folder / "export/materials.json", MaterialTable(dict(zip(names, (one, two), strict=True))))

@@ -27,7 +27,7 @@ def altered(inputs, light=1.0, materials=lambda m: m, tilt=0.0):
     facts["dataset.ground"]["front"] = {"ground": GROUND["ground"] | {"normal": [tilt, -1, -0.2]}}
     truth = SolvedSet(Inputs(inputs.folders, facts, inputs.files))
     own, truth.materials = truth.light, {name: materials(m) for name, m in truth.materials.items()}
-    truth.light = lambda name: own(name).scaled(light)
+    truth.light = lambda name: own(name).scale(light)
     return truth
 
 

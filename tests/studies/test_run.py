@@ -11,7 +11,8 @@ import pytest
 from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
-from studies.run import STUDIES, data_of, studies
+from studies.catalogue import STUDIES
+from studies.run import data_of, studies
 from studies.run.tables import write_index, write_study
 from studies.steps import score, solve, worlds
 from studies.study import QUICK

@@ -61,7 +61,7 @@ def with_columns(name="kitchen", count=64):
     visibility = (random.integers(0, 2, (len(seen), count)) * 255).astype(np.uint8)
     met = np.where(visibility == 0, random.integers(0, 2 * BINS, visibility.shape), NO_OCCLUDER).astype(np.uint16)
     sure = np.linspace(0, 1, len(seen)).astype("f4")
-    return msgspec.structs.replace(seen, visibility=visibility, met=met, confidence=sure, exposures=(2.0,))
+    return msgspec.structs.replace(seen, visibility=visibility, occluder=met, confidence=sure, exposures=(2.0,))
 
 
 @pytest.mark.parametrize("make", [with_columns, observations])
@@ -73,7 +73,7 @@ def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path, make):
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     for name in (*COLUMNS, *OPTIONAL):
         np.testing.assert_array_equal(getattr(again, name), getattr(seen, name).astype(getattr(again, name).dtype))
-    for name in ("visibility", "met"):
+    for name in ("visibility", "occluder"):
         np.testing.assert_array_equal(getattr(again, name), getattr(seen, name))
     known = tuple(exposure for exposure in seen.exposures if exposure)
     assert (again.materials, again.photos, again.exposures) == (("red", "white"), ("kitchen",), known)
@@ -83,7 +83,7 @@ def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path, make):
     ("'confidence' has a value outside 0 to 1", lambda seen: {"confidence": seen.confidence + 0.5}),
     ("'confidence' has a value outside 0 to 1", lambda seen: {"confidence": seen.confidence * np.nan}),
     ("'place' has a value that is not finite", lambda seen: {"place": seen.place * np.nan}),
-    ("met", lambda seen: {"met": seen.met * 0 + 2 * BINS}), ("met", lambda seen: {"met": seen.met[:, :32]}),
+    ("met", lambda seen: {"occluder": seen.occluder * 0 + 2 * BINS}), ("met", lambda seen: {"occluder": seen.occluder[:, :32]}),
 ])  # fmt: skip
 def test_values_that_mean_nothing_are_refused(tmp_path, key, change):
     seen = with_columns()
@@ -116,7 +116,7 @@ def test_merging_takes_weighted_means_and_the_codes_of_the_first():
         sums = (np.dot(each.weight.astype(float), getattr(each, name)) for each in (merged, seen))
         np.testing.assert_allclose(*sums, rtol=tolerance)
     first = [int(np.flatnonzero((seen.x == x) & (seen.y == y))[0]) for x, y in zip(merged.x, merged.y, strict=True)]
-    np.testing.assert_array_equal(merged.met, seen.met[first])
+    np.testing.assert_array_equal(merged.occluder, seen.occluder[first])
     assert 0 <= merged.confidence.min() and merged.confidence.max() <= 1 and merged.exposures == seen.exposures
 
 

@@ -32,7 +32,7 @@ Line = TypeVar("Line", CameraLine, ImageLine)
 
 def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the registered images of the model in the dataset's folder `path`, sorted by name."""
-    refuse.subfolder(KEY, path)
+    refuse.check_subfolder(KEY, path)
     pairs = [
         (refuse.file_in(KEY, path, f"cameras{suffix}"), refuse.file_in(KEY, path, f"images{suffix}"))
         for suffix in (".bin", ".txt")
@@ -53,16 +53,16 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
         for name, camera_id, _ in registered:
             if camera_id not in cameras:
                 raise ValueError(f"image {name!r} has camera {camera_id}, which {camera_file.name} lacks")
-    made = {
+    colmap_cameras = {
         number: colmap_camera(f"{KEY}: camera {number}", model, width, height, params, refuse)
         for number, model, width, height, params in cameras.values()
     }
     images = []
     for name, camera_id, (*quaternion, x, y, z) in registered:
         key = f"{KEY}: {one_line(name)}"
-        camera = made[camera_id]
+        camera = colmap_cameras[camera_id]
         length = math.hypot(*quaternion)
-        refuse.when(
+        refuse.refuse_if(
             not (0 < length <= LARGEST and max(abs(x), abs(y), abs(z)) <= LARGEST and not math.isnan(x + y + z)),
             key,
             "is no pose: its numbers are zero, not finite or too large",
@@ -110,10 +110,10 @@ def _binary_image(content: mmap.mmap, offset: int) -> tuple[ImageLine, int]:
     if end < 0:
         raise ValueError("the name of an image does not end")
     (points,) = struct.unpack_from("<Q", content, end + 1)
-    behind = end + 9 + points * struct.calcsize("<2dQ")
-    if behind > len(content):
+    next_offset = end + 9 + points * struct.calcsize("<2dQ")
+    if next_offset > len(content):
         raise ValueError("it ends in the middle of an image")
-    return (content[offset + 64 : end].decode("utf-8"), camera_id, tuple(pose)), behind
+    return (content[offset + 64 : end].decode("utf-8"), camera_id, tuple(pose)), next_offset
 
 
 def _text_cameras(file: Path) -> Iterator[CameraLine]:

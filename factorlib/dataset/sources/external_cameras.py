@@ -24,7 +24,7 @@ from factorlib.dataset.schema import (
 )
 from factorlib.dataset.sources.colmap import read_colmap
 from factorlib.dataset.sources.json_sources import read_bop, read_transforms
-from factorlib.dataset.sources.source_image import SourceImage, as_rows, pinhole, rigid
+from factorlib.dataset.sources.source_image import SourceImage, as_rows, pinhole, rigid_motion
 from factorlib.errors import did_you_mean
 
 SUFFIXES = (*IMAGES, ".webp", ".bmp")  # Other suffixes are part of a name: transforms.json may say "r_0.5".
@@ -47,7 +47,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
     external = {}
     photos = []
     kind = next(kind for kind in SOURCES if getattr(source, kind) is not None)
-    images = matched(spec, kind, READERS[kind](getattr(source, kind), refuse), refuse)
+    images = match_images(spec, kind, READERS[kind](getattr(source, kind), refuse), refuse)
     for photo in spec.photos:
         image = images.get(photo.name)
         if image is None:
@@ -62,9 +62,9 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
         else:
             hulls = {obj.name for obj in photo.objects if spec.meshes[obj.mesh].hull}
             poses = _poses(photo, image, source, hulls, refuse)
-            given = photo.camera
-            if given is not None and given.focal_px is not None and given.principal_point is not None:
-                camera = ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
+            intrinsics = photo.camera
+            if intrinsics is not None and intrinsics.focal_px is not None and intrinsics.principal_point is not None:
+                camera = ExternalCamera(kind, intrinsics.focal_px, intrinsics.principal_point, None, poses)
             else:
                 focal, centre = pinhole(image.camera, image.key, refuse)
                 camera = ExternalCamera(kind, focal, None if image.centred else centre, image.size, poses)
@@ -77,7 +77,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
     return msgspec.structs.replace(spec, photos=photos), external
 
 
-def matched(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Refusal) -> dict[str, SourceImage]:
+def match_images(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Refusal) -> dict[str, SourceImage]:
     """Match the photos to images of the source.
 
     The match is by `images`, else by path, by file name, or by file name without suffix; for BOP it is by id.
@@ -93,21 +93,23 @@ def matched(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Ref
     """
     assert spec.cameras is not None
     by_name = {image.name: image for image in images}
-    alike: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
+    by_pattern: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
     for image in images:
         path = PurePosixPath(str(image.name).replace("\\", "/"))
         stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
         for pattern in (("id", image.name), ("path", *path.parts), ("file", path.name), ("stem", stem)):
-            alike.setdefault(pattern, []).append(image)
+            by_pattern.setdefault(pattern, []).append(image)
     result = {}
     for photo in spec.photos:
         key = f"cameras.images.{photo.name}"
         if photo.name in spec.cameras.images:
             name = spec.cameras.images[photo.name]
-            refuse.when(name not in by_name, key, f"the source has no image {name!r}", did_you_mean(str(name), by_name))
+            refuse.refuse_if(
+                name not in by_name, key, f"the source has no image {name!r}", did_you_mean(str(name), by_name)
+            )
             result[photo.name] = by_name[name]
             continue
-        matches = ([image for pattern in each for image in alike.get(pattern, [])] for each in _patterns(photo))
+        matches = ([image for pattern in each for image in by_pattern.get(pattern, [])] for each in _patterns(photo))
         candidates = next(filter(None, matches), [])
         if len(candidates) > 1:
             names = ", ".join(repr(image.name) for image in candidates[:3])
@@ -143,7 +145,7 @@ def _poses(
         for obj in (obj for obj in objects if obj.mesh in source.obj_ids):
             obj_id = source.obj_ids[obj.mesh]
             instances = image.poses.get(obj_id, [])
-            refuse.when(
+            refuse.refuse_if(
                 len(instances) > 1,
                 f"cameras.obj_ids.{obj.mesh}",
                 f"image {image.name} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times",
@@ -159,7 +161,7 @@ def _poses(
                     photo.name,
                 )
             for pose in instances:
-                poses[obj.name] = RigidTransform(pose.rotation, _divided(pose.translation, source.mesh_unit_mm))
+                poses[obj.name] = RigidTransform(pose.rotation, _divide(pose.translation, source.mesh_unit_mm))
         return poses
     similarities = {name: Similarity() for name in hulls} | source.world_from_object
     placed = {obj.name: similarities[obj.name] for obj in objects if obj.name in similarities}
@@ -169,13 +171,13 @@ def _poses(
         refuse("cameras.world_from_object", fault, "scale the mesh files so that a photo's objects have one scale")
     for name, similarity in placed.items():  # The mesh's unit replaces the source's, which changes no picture.
         assert image.cam_from_world is not None  # only bop has no world
-        cam_from_object = image.cam_from_world * rigid(similarity.rotation, similarity.translation)
-        translation = _divided(cam_from_object.translation, similarity.scale)
+        cam_from_object = image.cam_from_world * rigid_motion(similarity.rotation, similarity.translation)
+        translation = _divide(cam_from_object.translation, similarity.scale)
         poses[name] = RigidTransform(as_rows(cam_from_object.rotation), translation)
     return poses
 
 
-def _divided(vector: Iterable[float], unit: float) -> Vec3:
+def _divide(vector: Iterable[float], unit: float) -> Vec3:
     """Return a vector in another unit."""
     x, y, z = (float(value) / unit for value in vector)
     return x, y, z

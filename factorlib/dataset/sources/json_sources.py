@@ -16,7 +16,7 @@ import pycolmap
 
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import FOCAL_PX, Centre, Focal, Number, RigidTransform, Vec3
-from factorlib.dataset.sources.source_image import SIDE_PX, SourceImage, colmap_camera, read_source, rigid
+from factorlib.dataset.sources.source_image import SIDE_PX, SourceImage, colmap_camera, read_source, rigid_motion
 from factorlib.reading import one_line
 
 FISHEYE = "OPENCV_FISHEYE"
@@ -84,15 +84,15 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
         centred = lens.cx is None or lens.cy is None
         matrix_key = f"{key}.transform_matrix"
         rows = frame.transform_matrix
-        refuse.when(
+        refuse.refuse_if(
             len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)),
             matrix_key,
             "is not a rigid matrix",
             "give the rows [R | t], and [0, 0, 0, 1] below them or nothing",
         )
-        refuse.rotation(matrix_key, tuple(row[:3] for row in rows[:3]))
+        refuse.check_rotation(matrix_key, tuple(row[:3] for row in rows[:3]))
         right, down, forward = ((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
-        cam_from_world = rigid((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
+        cam_from_world = rigid_motion((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
         images.append(SourceImage(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
     return images
 
@@ -112,7 +112,7 @@ def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Came
                 "give the focal length fl_x in pixels, with w and h",
             )
         focal = (lens.w or ANY_WIDTH) / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
-        refuse.when(
+        refuse.refuse_if(
             not FOCAL_PX[0] <= focal <= FOCAL_PX[1],
             f"{key}.camera_angle_x",
             f"an angle of {angle:g} is no field of view",
@@ -171,7 +171,7 @@ def read_bop(path: str, refuse: Refusal) -> list[SourceImage]:
     images = []
     for image, camera in sorted(cameras.items(), key=lambda item: int(item[0])):
         fx, skew, cx, _, fy, cy, _, _, _ = camera.cam_K
-        camera_refusal.when(
+        camera_refusal.refuse_if(
             skew != 0 or min(fx, fy, cx, cy) <= 0,
             f"{image}.cam_K",
             "has a skew, or a focal length or principal point that is not positive",
@@ -184,7 +184,7 @@ def read_bop(path: str, refuse: Refusal) -> list[SourceImage]:
         instances: dict[int, list[RigidTransform]] = {}
         for index, obj in enumerate(poses.get(image, [])):
             rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
-            pose_refusal.rotation(f"{image}[{index}].cam_R_m2c", rows)
+            pose_refusal.check_rotation(f"{image}[{index}].cam_R_m2c", rows)
             instances.setdefault(obj.obj_id, []).append(RigidTransform(rows, obj.cam_t_m2c))
         images.append(SourceImage(int(image), pinhole, None, f"{CAMERAS}: {image}", poses=instances))
     return images

@@ -75,13 +75,13 @@ def colmap_camera(
         refuse: raises errors
     """
     fault = f"is no camera: {width:g}×{height:g} pixels, {model} {', '.join(f'{x:g}' for x in params)}"
-    refuse.when(
+    refuse.refuse_if(
         not (1 <= width <= SIDE_PX and 1 <= height <= SIDE_PX),
         key,
         fault,
         f"an image is 1 to {SIDE_PX:g} pixels wide and high; {DAMAGED}",
     )
-    refuse.when(not all(abs(x) <= LARGEST for x in params), key, fault, DAMAGED)
+    refuse.refuse_if(not all(abs(x) <= LARGEST for x in params), key, fault, DAMAGED)
     return pycolmap.Camera(model=model, width=round(width), height=round(height), params=list(params))
 
 
@@ -115,23 +115,23 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         error = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
     if not error <= MOST_OFF_PX:  # NaN where a pixel has no ray
         extent = f"by {error:.1f} px" if error == error else "so much that some pixels have no ray"
-        how = "the camera's lens distorts"
+        cause = "the camera's lens distorts"
         cure = (
             "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
             "or undistort by `colmap image_undistorter` and use its images, its model, and masks of them"
         )
         if camera.is_undistorted():
-            how = "the camera's pixels are not square"
+            cause = "the camera's pixels are not square"
             cure = (
                 "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
                 "or resample photos and masks to square pixels"
             )
         limit = f"at most {MOST_OFF_PX} px is allowed"
-        refuse(key, f"{how}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
+        refuse(key, f"{cause}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
     return focal, centre
 
 
-def rigid(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
+def rigid_motion(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
     """Return the rigid motion of a rotation matrix (made orthonormal) and a translation."""
     turn = pycolmap.Rotation3d(rotation)
     turn.normalize()

@@ -15,18 +15,18 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageColor, ImageDraw
 
-from factorlib.dataset.read import FILE, OPEN, UNKNOWN, read_draft
+from factorlib.dataset.read_dataset import FILE, OPEN, UNKNOWN, read_draft
 from factorlib.dataset.schema import DatasetFile, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.images.photo import decoded, open_photo
+from factorlib.images.photo import decode_photo, open_photo
 from factorlib.images.picture import nearest_tags, picture, png_bytes
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.tone import srgb_decode
-from factorlib.labels.labels import Labels, read_labels
+from factorlib.labels.label_image import Labels, read_labels
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.reading import path_inside
 from factorlib.wholefile import write_bytes
 
@@ -43,7 +43,7 @@ MOST_PHOTOS = 100
 Pixels = UInt8[np.ndarray, "h w 3"]
 
 
-def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda done, total: None) -> None:
+def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda index, total: None) -> None:
     """Write the contact sheet of the dataset in a folder as a PNG, of its first MOST_PHOTOS photos.
 
     Photos and meshes that cannot be read are left out, because `validate` reports them.
@@ -60,33 +60,33 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
     names = list(dict.fromkeys([*spec.materials, *[OPEN] * bool(faults)]))
     photos = spec.photos[:MOST_PHOTOS]
     pictures = []
-    for done, photo in enumerate(photos):
-        report(done, 2 * len(photos))
+    for index, photo in enumerate(photos):
+        report(index, 2 * len(photos))
         pictures.append(_photo(folder, spec, photo))
     colours = _colours(names, [(image, labels) for image, labels in pictures if labels is not None])
     rows = []
-    for done, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
-        report(len(photos) + done, 2 * len(photos))
+    for index, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
+        report(len(photos) + index, 2 * len(photos))
         named = [(photo.name, image)]
         if labels is not None:
-            named.append(("labels", _coloured(image, labels, colours)))
+            named.append(("labels", _colour_labels(image, labels, colours)))
         for obj in photo.objects:
             entry = spec.meshes.get(obj.mesh)
             if entry is None or entry.file is None:  # left open, or reconstructed from the masks
                 continue
             with suppress(InputError, ValueError):
                 mesh = read_mesh(path_inside(folder, entry.file), names, entry.part_materials, obj.materials)
-                named.append((obj.name, drawn(mesh, colours)))
+                named.append((obj.name, render_mesh(mesh, colours)))
         titled = []
         for title, each in named:
             head = Image.new("RGB", (each.shape[1], HEAD), PAPER)
             ImageDraw.Draw(head).text((0, 2), title, fill=INK)
             titled.append(np.concatenate([np.asarray(head), each]))
         tall = max(len(each) for each in titled) + MARGIN
-        rows.append(np.concatenate([_padded(each, tall, each.shape[1] + MARGIN) for each in titled], axis=1))
+        rows.append(np.concatenate([_pad(each, tall, each.shape[1] + MARGIN) for each in titled], axis=1))
     rows.insert(0, legend([UNKNOWN if name == OPEN else name for name in names], colours, rows[0].shape[1]))
     wide = max(row.shape[1] for row in rows)
-    write_bytes(path, png_bytes(np.concatenate([_padded(row, len(row), wide) for row in rows])))
+    write_bytes(path, png_bytes(np.concatenate([_pad(row, len(row), wide) for row in rows])))
 
 
 def _photo(folder: Path, spec: DatasetFile, photo: PhotoEntry) -> tuple[Pixels, Labels | None]:
@@ -99,7 +99,7 @@ def _photo(folder: Path, spec: DatasetFile, photo: PhotoEntry) -> tuple[Pixels, 
         stored = open_photo(file(photo.image), f"{key}.image")
         check_pixels(stored.size, MOST_MEGAPIXELS, photo.image)
         factor = max(1, -(-max(stored.size) // SIDE))
-        image = picture(decoded(stored, photo.encoding, factor, file(photo.image)).radiance, 1.0)
+        image = picture(decode_photo(stored, photo.encoding, factor, file(photo.image)).radiance, 1.0)
         whole = read_labels(photo.masks or OPEN, file, spec.materials, stored.size, photo.image, f"{key}.masks")
         height, width = image.shape[:2]
         fewer = slice(factor // 2, factor * height, factor), slice(factor // 2, factor * width, factor)
@@ -107,7 +107,7 @@ def _photo(folder: Path, spec: DatasetFile, photo: PhotoEntry) -> tuple[Pixels, 
     return image, labels
 
 
-def _coloured(image: Pixels, labels: Labels, colours: UInt8[np.ndarray, "k 3"]) -> Pixels:
+def _colour_labels(image: Pixels, labels: Labels, colours: UInt8[np.ndarray, "k 3"]) -> Pixels:
     grey = np.repeat((0.3 * image.mean(axis=-1, keepdims=True) + 150).astype(np.uint8), 3, axis=-1)
     tinted = (0.75 * colours[labels.label] + 0.25 * image).astype(np.uint8)
     pixels = np.where(labels.label[..., None] > 0, tinted, grey)
@@ -116,7 +116,7 @@ def _coloured(image: Pixels, labels: Labels, colours: UInt8[np.ndarray, "k 3"]) 
     return pixels
 
 
-def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
+def render_mesh(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
     """Render a mesh in the colours of its labels, shaded by a light at the camera."""
     camera = Camera(MESH_SIDE, MESH_SIDE, MESH_SIDE * DISTANCE / 2.2, (MESH_SIDE / 2, MESH_SIDE / 2))
     rotation = np.diag([1.0, -1.0, -1.0])
@@ -130,8 +130,8 @@ def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[n
     """Return distinct colours by label, near the photos' mean colours; row 0 is the background's."""
     pixels = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image, _ in pictures)])
     labels = np.concatenate([np.zeros(0), *(labels.label.ravel() for _, labels in pictures)])
-    own = [pixels[labels == k] for k in range(1, len(names) + 1)]
-    mean = [each.mean(axis=0) / 255 if len(each) else np.full(3, 0.5) for each in own]
+    material_pixels = [pixels[labels == k] for k in range(1, len(names) + 1)]
+    mean = [each.mean(axis=0) / 255 if len(each) else np.full(3, 0.5) for each in material_pixels]
     tags = nearest_tags(names, srgb_decode(np.array(mean)))
     return np.array([PAPER, *(ImageColor.getrgb(tags[name]) for name in names)], np.uint8)
 
@@ -153,6 +153,6 @@ def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> 
     return np.asarray(sheet)
 
 
-def _padded(pixels: Pixels, height: int, width: int) -> Pixels:
+def _pad(pixels: Pixels, height: int, width: int) -> Pixels:
     pad = ((0, height - pixels.shape[0]), (0, width - pixels.shape[1]), (0, 0))
     return np.pad(pixels, pad, constant_values=255)

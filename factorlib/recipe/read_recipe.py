@@ -82,7 +82,7 @@ def check_recipe(
 
 def _check_names(refuse: Refusal, key: str, names: Iterable[str], known: list[str], kind: str) -> None:
     for name in names:
-        refuse.known(key, name, known, kind)
+        refuse.check_known(key, name, known, kind)
 
 
 def _check_distinct(refuse: Refusal, key: str, names: list[str], kind: str) -> None:
@@ -135,9 +135,9 @@ def _check_new_object(
                 "name one material",
             )
     elif recipe.material is not None:
-        refuse.known("material", recipe.material, materials, "material")
+        refuse.check_known("material", recipe.material, materials, "material")
     if not is_mesh_file(recipe.mesh):
-        refuse.known("mesh", recipe.mesh, [BALL, *meshes], "mesh")
+        refuse.check_known("mesh", recipe.mesh, [BALL, *meshes], "mesh")
     elif Path(recipe.mesh).suffix.lower() not in MESHES:
         refuse("mesh", f"{recipe.mesh!r} is no mesh file that can be read", f"give one of {', '.join(MESHES)}")
 

@@ -11,7 +11,7 @@ FILE = "surface.json"
 BEGINNING = "beginning.json"
 
 
-class Tried(msgspec.Struct, frozen=True):
+class DetailEvidence(msgspec.Struct, frozen=True):
     """Evidence for a refinement from photos that it was not estimated from; None for what was not tried.
 
     Attributes:
@@ -27,7 +27,7 @@ class Tried(msgspec.Struct, frozen=True):
     stiffness: float | None = None
 
     @classmethod
-    def of(cls, evidence: Any, stiffness: float | None) -> "Tried":
+    def from_decision(cls, evidence: Any, stiffness: float | None) -> "DetailEvidence":
         """Convert the solver's decision and the chosen stiffness."""
         return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
 
@@ -48,9 +48,9 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     """
 
     moved: bool = False
-    moved_by: Tried = Tried()
+    moved_by: DetailEvidence = DetailEvidence()
     painted: bool = False
-    painted_by: Tried = Tried()
+    painted_by: DetailEvidence = DetailEvidence()
     gains: dict[str, float] = {}
     displacements: dict[str, list[float]] = {}
     log_factors: dict[str, list[float]] = {}

@@ -2,10 +2,10 @@
 
 import re
 
+from factorlib.contact_sheet import HEAD, MARGIN, MESH_SIDE, write_sheet
 from factorlib.images.picture import read_png
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
-from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, write_sheet
 from tests.faults import sample
 from tests.refusal import refusal
 

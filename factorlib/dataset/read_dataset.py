@@ -72,7 +72,7 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     text = read_text(file, "a YAML file", most_bytes=MOST_BYTES)
     value = parse_yaml(text, file)
     places: list[str] = []
-    value = _filled(value, "", places)
+    value = _fill_placeholders(value, "", places)
     faults = []
     if places:
         listed = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
@@ -86,35 +86,37 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     try:
         spec = convert(value, DatasetFile, file, text=text)
     except InputError as error:
-        raise_all(faults + _others(error, places))
+        raise_all(faults + _independent_faults(error, places))
     try:
         check_dataset(spec, file)
     except InputError as error:
-        faults += _others(error, places)
+        faults += _independent_faults(error, places)
     return spec, faults
 
 
-def _others(error: InputError, places: list[str]) -> list[InputError]:
+def _independent_faults(error: InputError, places: list[str]) -> list[InputError]:
     """Return the faults that are neither open places nor consequences of them."""
 
     def follows(fault: InputError) -> bool:
         """Return True if a fault is an open place or follows from one."""
         unnamed = "materials[0]" in places and fault.fault.startswith("unknown material")
-        return unnamed or any(_within(place, fault.key) or _within(fault.key, place) for place in places)
+        return unnamed or any(_is_within(place, fault.key) or _is_within(fault.key, place) for place in places)
 
     return [fault for fault in getattr(error, "faults", [error]) if not follows(fault)]
 
 
-def _within(key: str | None, other: str | None) -> bool:
+def _is_within(key: str | None, other: str | None) -> bool:
     return key is not None and (key == other or key.startswith((f"{other}.", f"{other}[")))
 
 
-def _filled(value: Any, key: str, places: list[str]) -> Any:
+def _fill_placeholders(value: Any, key: str, places: list[str]) -> Any:
     """Replace each `?`, which `make new` writes, by a placeholder and add its key to `places`."""
     if isinstance(value, dict):
-        return {name: _filled(item, f"{key}.{name}" if key else name, places) for name, item in value.items()}
+        return {
+            name: _fill_placeholders(item, f"{key}.{name}" if key else name, places) for name, item in value.items()
+        }
     if isinstance(value, list):
-        return [_filled(item, f"{key}[{index}]", places) for index, item in enumerate(value)]
+        return [_fill_placeholders(item, f"{key}[{index}]", places) for index, item in enumerate(value)]
     if value == UNKNOWN:
         places.append(key)
     return OPEN if value == UNKNOWN else value

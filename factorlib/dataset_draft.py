@@ -28,14 +28,14 @@ from factorlib.align.coarse import HIDDEN, match_parts
 from factorlib.align.silhouette import UNKNOWN as HIDES
 from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
-from factorlib.dataset.read import UNKNOWN
+from factorlib.dataset.read_dataset import UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME, MAX_MATERIALS
 from factorlib.errors import InputError
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
-from factorlib.labels.labels import read_labels
+from factorlib.labels.label_image import read_labels
 from factorlib.labels.mask_files import Category, read_inside, read_values
-from factorlib.meshes.read import read_mesh, read_parts
+from factorlib.meshes.read_mesh import read_mesh, read_parts
 from factorlib.reading import read_bytes, reading
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
@@ -155,7 +155,9 @@ def _visible_meshes(
     for photo in photos:
         masks = labelled.by_photo.get(photo)
         materials = masks if isinstance(masks, dict) else ()
-        visible[photo] = _shown_in(photo, entries) or sorted({mesh_of[word] for word in materials if times[word] == 1})
+        visible[photo] = _meshes_named_in(photo, entries) or sorted(
+            {mesh_of[word] for word in materials if times[word] == 1}
+        )
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in photos if not visible[photo]]
     return visible
@@ -176,7 +178,7 @@ def _photo_entries(
         objects = [{"name": mesh, "mesh": mesh} for mesh in visible[photo] or [UNKNOWN] * bool(entries)]
         if objects and (silhouettes := labelled.silhouettes.get(photo)):
             only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
-            mesh_of = {name: (_shown_in(name, entries) or [only])[0] for name in silhouettes}
+            mesh_of = {name: (_meshes_named_in(name, entries) or [only])[0] for name in silhouettes}
             objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes.items()]
         mask = labelled.by_photo.get(photo, UNKNOWN)
         photos.append({"name": photo, "image": path, "masks": mask, "objects": objects})
@@ -296,35 +298,35 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
     """
     materials = spec["materials"]
     for name, entry in spec["meshes"].items():
-        of = entry.get("parts", {})
+        part_materials = entry.get("parts", {})
         objects: list[tuple[str, dict]] = []
         silhouettes = []
         known = []
-        if UNKNOWN not in of.values():
+        if UNKNOWN not in part_materials.values():
             continue
         for photo in spec["photos"]:
             for obj in photo["objects"]:
-                alone = "mask" in obj or len(photo["objects"]) == 1
-                if obj["mesh"] == name and alone and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
+                is_separate = "mask" in obj or len(photo["objects"]) == 1
+                if obj["mesh"] == name and is_separate and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
                     with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
                         silhouettes.append(_silhouette(photo, obj, materials, file))
                         objects.append((photo["name"], obj))
-        mesh = read_mesh(file(entry["file"]), list(of), {part: part for part in of})
-        told = match_parts(mesh, len(of), silhouettes)
-        for k, part in [(k, part) for k, part in enumerate(of) if of[part] == UNKNOWN]:
-            ranked = [paired.labels[k] if paired else [] for paired in told]
-            margins = [paired.margins[k] if paired else 0.0 for paired in told]
+        mesh = read_mesh(file(entry["file"]), list(part_materials), {part: part for part in part_materials})
+        matches = match_parts(mesh, len(part_materials), silhouettes)
+        for k, part in [(k, part) for k, part in enumerate(part_materials) if part_materials[part] == UNKNOWN]:
+            ranked = [paired.labels[k] if paired else [] for paired in matches]
+            margins = [paired.margins[k] if paired else 0.0 for paired in matches]
             sure = [margin >= MARGIN and each[0] != HIDDEN for margin, each in zip(margins, ranked)]
             likely = [" or ".join(materials[label - 1] for label in each if label != HIDDEN) for each in ranked]
             if not any(sure):
                 first = max(likely, key=len, default="")
-                of[part] = f"{UNKNOWN}{BESIDE}{first}" if first else UNKNOWN
+                part_materials[part] = f"{UNKNOWN}{BESIDE}{first}" if first else UNKNOWN
                 missing.append(f"mesh {name}: write which material {part} is made of" + f" ({first})" * bool(first))
                 continue
             usual = Counter(each[0] for each, yes in zip(ranked, sure) if yes).most_common(1)[0][0]
             least = min(margin for margin, yes in zip(margins, sure) if yes)
             known.append(part)
-            of[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
+            part_materials[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
             for (photo, obj), each, yes, words in zip(objects, ranked, sure, likely):
                 if yes and each[0] != usual:
                     obj.setdefault("materials", {})[part] = materials[each[0] - 1]
@@ -348,10 +350,10 @@ def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[st
     return Silhouette(label[::every, ::every])
 
 
-def _shown_in(photo: str, meshes: Collection[str]) -> list[str]:
+def _meshes_named_in(photo: str, meshes: Collection[str]) -> list[str]:
     """Return the meshes that a photo shows: the only one, or those whose names are whole words of the photo's.
 
-    >>> _shown_in("my_red-chair_2", ["stool", "chair", "red-chair", "hair"])
+    >>> _meshes_named_in("my_red-chair_2", ["stool", "chair", "red-chair", "hair"])
     ['chair', 'red-chair']
     """
     ends = [end for word in re.finditer("[A-Za-z0-9]+", photo) for end in word.span()]
@@ -385,8 +387,8 @@ def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool 
 def _by_name(paths: list[Path], key: str) -> dict[str, Path]:
     named: dict[str, Path] = {}
     for path in paths:
-        if (other := named.setdefault(name := _word(path.stem), path)) != path:
-            fault = f"{path.name} and {other.name} would both be called {name!r}"
+        if (namesake := named.setdefault(name := _word(path.stem), path)) != path:
+            fault = f"{path.name} and {namesake.name} would both be called {name!r}"
             raise InputError(fault, file=path, key=key, cure="rename one of them")
     return named
 

@@ -57,26 +57,26 @@ def read_labels(
     Raises:
         InputError: If the masks are invalid or empty.
     """
-    where = file(masks if isinstance(masks, str) else next(iter(masks.values())))
+    mask_file = file(masks if isinstance(masks, str) else next(iter(masks.values())))
     if not isinstance(masks, str):
         places = {name: (file(masks[name]), f"{key}.{name}") for name in sorted(masks, key=materials.index)}
         labels = _merged({name: read_inside(*place, size) for name, place in places.items()}, materials, places, edge=0)
     elif masks.lower().endswith(".json"):
-        inside = read_coco(where, image, materials, size, key)
-        labels = _merged(inside, materials, dict.fromkeys(inside, (where, key)), edge=DRAWN_EDGE)
+        inside = read_coco(mask_file, image, materials, size, key)
+        labels = _merged(inside, materials, dict.fromkeys(inside, (mask_file, key)), edge=DRAWN_EDGE)
     else:
-        labels = _labels_of_png(read_values(where, key, size), where, materials, key)
+        labels = _labels_of_png(read_values(mask_file, key, size), mask_file, materials, key)
     if labels is None or not labels.label.any():
         raise InputError(
             "the mask is empty: no pixel has a material",
-            file=where,
+            file=mask_file,
             key=key,
             cure="paint at least one material, or drop the photo",
         )
     return labels
 
 
-def read_objects(
+def read_object_indices(
     masks: list[tuple[str, str | None]], file: Callable[[str], Path], size: tuple[int, int], key: str = "objects"
 ) -> UInt16[np.ndarray, "h w"]:
     """Read the index (from 1) of the object whose own mask covers each pixel, 0 for none.
@@ -97,22 +97,22 @@ def read_objects(
     for index, (name, path) in enumerate(masks):
         if path is None:
             continue
-        where = f"{key}[{index}].mask"
-        inside = read_inside(file(path), where, size)
+        mask_key = f"{key}[{index}].mask"
+        inside = read_inside(file(path), mask_key, size)
         if not inside.any():
             raise InputError(
                 f"the mask of object {name!r} is empty",
                 file=file(path),
-                key=where,
+                key=mask_key,
                 cure="paint it, or leave the key out",
             )
         if objects[inside].any():
-            other = int(objects[inside & (objects > 0)][0]) - 1
-            count = int((objects[inside] == other + 1).sum())
+            overlapped = int(objects[inside & (objects > 0)][0]) - 1
+            count = int((objects[inside] == overlapped + 1).sum())
             raise InputError(
-                f"objects {masks[other][0]!r} and {name!r} share {count} pixels",
+                f"objects {masks[overlapped][0]!r} and {name!r} share {count} pixels",
                 file=file(path),
-                key=where,
+                key=mask_key,
                 cure="a pixel shows one object: erase it from the one behind",
             )
         objects[inside] = index + 1
@@ -134,7 +134,7 @@ def check_materials(
 
     Args:
         labels: Labels of the photo.
-        objects: Result of `read_objects`; objects without a mask of their own share the rest of the photo.
+        objects: Result of `read_object_indices`; objects without a mask of their own share the rest of the photo.
         object_materials: Name and materials of each object.
         materials: Materials of the dataset, in order.
         path: Path of the mask, to name in errors.
@@ -144,8 +144,8 @@ def check_materials(
         InputError: If both faults occur.
     """
     groups = [([k], objects == k + 1) for k in range(len(object_materials)) if (objects == k + 1).any()]
-    alone = [k for k in range(len(object_materials)) if not (objects == k + 1).any()]
-    for members, region in [*groups, (alone, objects == 0)] if alone else groups:
+    unmasked = [k for k in range(len(object_materials)) if not (objects == k + 1).any()]
+    for members, region in [*groups, (unmasked, objects == 0)] if unmasked else groups:
         counts = np.bincount(labels.label[region], minlength=len(materials) + 1)[1:]
         expected = set().union(*(object_materials[k][1] for k in members))
         unexpected = [
@@ -184,7 +184,7 @@ def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: lis
 
 
 def _merged(
-    inside: Mapping[str, np.ndarray], materials: list[str], where: Mapping[str, tuple[Path, str]], edge: int
+    inside: Mapping[str, np.ndarray], materials: list[str], sources: Mapping[str, tuple[Path, str]], edge: int
 ) -> Labels | None:
     """Merge several masks into one map; None if there are none.
 
@@ -195,11 +195,11 @@ def _merged(
     label = np.zeros(next(iter(inside.values())).shape, dtype=np.uint8)
     left_out = label > 0
     for number, material in ((k, name) for k, name in enumerate(materials, 1) if name in inside):
-        path, key = where[material]
-        for other in np.unique(label[inside[material] & (label > 0)]).tolist():
-            shared = inside[material] & (label == other)
-            other_path = where[materials[other - 1]][0]
-            fault = f"materials {materials[other - 1]!r} and {material!r} share {int(shared.sum())} pixels"
+        path, key = sources[material]
+        for claimed in np.unique(label[inside[material] & (label > 0)]).tolist():
+            shared = inside[material] & (label == claimed)
+            other_path = sources[materials[claimed - 1]][0]
+            fault = f"materials {materials[claimed - 1]!r} and {material!r} share {int(shared.sum())} pixels"
             fault += f" with {other_path.name}" if other_path != path else ""
             square = (edge + 1, edge + 1)
             if min(shared.shape) > edge and sliding_window_view(shared, square).all((2, 3)).any():

@@ -48,11 +48,11 @@ class Visibility(msgspec.Struct, frozen=True):
     """Visibility of k directions from n points.
 
     visibility  255 where a direction is free of the objects, 0 where not
-    met         codes of the surfaces that are hit
+    occluder    codes of the surfaces that are hit
     """
 
     visibility: UInt8[np.ndarray, "n k"]
-    met: UInt16[np.ndarray, "n k"]
+    occluder: UInt16[np.ndarray, "n k"]
 
 
 class Occluders(Caster):
@@ -81,15 +81,15 @@ class Occluders(Caster):
             The points.
         """
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
-        distance, face, behind = self._first(self._rays(np.zeros_like(along), along))
+        distance, face, is_back = self._first(self._rays(np.zeros_like(along), along))
         valid = np.isfinite(distance)
         depth = np.where(valid, distance * self.radius, 0.0)
-        normal = self.hit_normals(face, behind)
+        normal = self.hit_normals(face, is_back)
         return SurfacePoints(depth[:, None] * along + self.lift[face][:, None] * normal, normal, valid)
 
-    def hit_normals(self, face: Int[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]) -> Vectors:
-        """Return the normals of faces, flipped where the face is hit from `behind`."""
-        return np.where(behind[:, None], -self.normal[face], self.normal[face])
+    def hit_normals(self, face: Int[np.ndarray, " n"], is_back: Bool[np.ndarray, " n"]) -> Vectors:
+        """Return the normals of faces, flipped where the face is hit from behind."""
+        return np.where(is_back[:, None], -self.normal[face], self.normal[face])
 
     def visibility_at(
         self,
@@ -126,7 +126,7 @@ class Occluders(Caster):
         spacing = max(float(np.median(cKDTree(cast.place).query(cast.place, k=2)[0][:, 1])), 1e-12)
         places = np.column_stack([points.place / spacing, NORMAL_WEIGHT * shading_normal])
         nearest = cKDTree(places[subset]).query(places)[1]
-        return Visibility(visibility.visibility[nearest], visibility.met[nearest])
+        return Visibility(visibility.visibility[nearest], visibility.occluder[nearest])
 
     def visibility_from(
         self,
@@ -147,13 +147,13 @@ class Occluders(Caster):
             Visibility and codes of the hiding surfaces.
         """
         visibility = np.full((len(shading_normal), len(directions)), 255, np.uint8)
-        met = np.full(visibility.shape, NO_OCCLUDER, np.uint16)
+        occluder = np.full(visibility.shape, NO_OCCLUDER, np.uint16)
         material = self.mesh.face_label.astype(np.int64) - 1
         codes = np.array([[*occluder_codes(material, normal), NO_OCCLUDER] for normal in (self.normal, -self.normal)])
-        for row, k, face, behind in self.hidden_from(points, shading_normal, directions, report):
+        for row, k, face, is_back in self.hidden_from(points, shading_normal, directions, report):
             visibility[row, k] = 0
-            met[row, k] = codes[behind.astype(int), face]
-        return Visibility(visibility, met)
+            occluder[row, k] = codes[is_back.astype(int), face]
+        return Visibility(visibility, occluder)
 
     def hidden_from(
         self,
@@ -183,8 +183,8 @@ class Occluders(Caster):
             below = np.maximum(GRAZING - normal @ directions.T, 0)[row, k]
             rays = self._rays(points.place[rows][row], directions[k] + below[:, None] * normal[row])
             hidden = self.scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
-            distance, face, behind = self._first(rays[hidden])
-            yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), behind
+            distance, face, is_back = self._first(rays[hidden])
+            yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), is_back
 
     def _first(self, rays: Float[np.ndarray, "n 6"]) -> tuple[np.ndarray, ...]:
         """Return the first hits of rays: distance in radii (inf for none), face, and whether it is hit from behind."""

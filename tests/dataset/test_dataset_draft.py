@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factorlib.dataset.read import read_dataset
-from factorlib.newset import new_dataset
+from factorlib.dataset.read_dataset import read_dataset
+from factorlib.dataset_draft import new_dataset
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
 from tests.align.test_align import LAMP, TWINS, silhouette_of

@@ -15,11 +15,11 @@ import numpy as np
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
 from factorlib.meshes.gltf_mesh import read_gltf
-from factorlib.meshes.mesh import Mesh, area_vectors, consistently_wound, corner_normals, welded
+from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipped_faces, weld_vertices
 from factorlib.meshes.obj import read_obj
 from factorlib.meshes.ply_stl_off import read_off, read_ply, read_stl
 from factorlib.meshes.subdivision import subdivided_mesh
-from factorlib.meshes.triangle_soup import NO_LIMITS, Limits, TriangleSoup, check
+from factorlib.meshes.triangle_soup import NO_LIMITS, Limits, TriangleSoup, check_soup
 from factorlib.reading import one_line, read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # formats of a single file
@@ -120,7 +120,7 @@ class MeshCache:
                         cure="run `surface` again",
                     )
                 detail = np.exp(factors)[dense.node] if name in self.log_factors else None
-                mesh = msgspec.structs.replace(dense.moved(moves), detail=detail)
+                mesh = msgspec.structs.replace(dense.displace(moves), detail=detail)
             self._meshes[key] = mesh
         return self._meshes[key]
 
@@ -138,7 +138,7 @@ def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:
         else:
             soup = read_gltf(path, limits)
     limits.check_parts(len(soup.parts), path)
-    return check(soup, path)
+    return check_soup(soup, path)
 
 
 def part_labels(
@@ -176,16 +176,16 @@ def part_labels(
             )
     labels = []
     for part_names in names:
-        chosen = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})
+        candidates = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})
         title = one_line(" / ".join(part_names)) or "(unnamed)"
-        if len(chosen) > 1:
-            fault = f"part {title} gets several materials: {', '.join(sorted(filter(None, chosen)))}"
+        if len(candidates) > 1:
+            fault = f"part {title} gets several materials: {', '.join(sorted(filter(None, candidates)))}"
             raise InputError(fault, file=file, cure="give a material to one of its names only")
-        if None in chosen:
+        if None in candidates:
             example = f"add it to `parts`, e.g. {one_line(part_names[0])}: {materials[0]}" if part_names else None
             cure = example or "name the part in a mesh editor"
             raise InputError(f"part {title} has no material", file=file, key=title, cure=cure)
-        labels.append(list(materials).index(*chosen) + 1)
+        labels.append(list(materials).index(*candidates) + 1)
     return np.array(labels, dtype=np.int16)
 
 
@@ -208,7 +208,7 @@ def usable(soup: TriangleSoup, face_label: np.ndarray, crease_deg: float, file: 
     faces = faces[keep]
     face_label = face_label[keep]
     supplied = soup.normals[keep]
-    flip, is_open = consistently_wound(vertices, faces)
+    flip, is_open = find_flipped_faces(vertices, faces)
     faces = np.where(flip[:, None], faces[:, ::-1], faces)
     supplied = np.where(flip[:, None, None], -supplied[:, ::-1], supplied)
     if flip.any():
@@ -236,7 +236,7 @@ def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray,
         InputError: If no face is left.
     """
     used, faces = np.unique(soup.faces, return_inverse=True)  # an unused vertex far away must not set the scale
-    weld = welded(soup.vertices[used])
+    weld = weld_vertices(soup.vertices[used])
     vertices = soup.vertices[used][np.unique(weld, return_index=True)[1]]
     faces = weld[faces.reshape(-1, 3)]
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
@@ -244,9 +244,9 @@ def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray,
     solid = distinct & (np.linalg.norm(area_vectors(vertices, faces), axis=1) > 1e-14 * extent**2)
     single = np.zeros(len(faces), bool)  # no duplicate of an earlier face, in either winding
     single[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]] = True
-    for count, what in ((int((~solid).sum()), "zero-area"), (int((solid & ~single).sum()), "duplicate")):
+    for count, defect in ((int((~solid).sum()), "zero-area"), (int((solid & ~single).sum()), "duplicate")):
         if count:
-            log.info("%s: %d %s faces dropped", file, count, what)
+            log.info("%s: %d %s faces dropped", file, count, defect)
     if not (solid & single).any():
         raise InputError(
             "every face has zero area",

@@ -9,7 +9,7 @@ from PIL import Image
 from pycocotools import mask as pycocomask
 
 from factorlib.labels.grow import grow
-from factorlib.labels.labels import Labels, check_materials, read_labels, read_objects
+from factorlib.labels.label_image import Labels, check_materials, read_labels, read_object_indices
 from factorlib.labels.mask_files import read_values, run_lengths
 from tests.refusal import refusal
 
@@ -141,7 +141,7 @@ def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
 
 
 def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(tmp_path):
-    objects = lambda *masks: read_objects(masks, lambda name: tmp_path / name, (H, W), "photos[kitchen].objects")  # noqa: E731
+    objects = lambda *masks: read_object_indices(masks, lambda name: tmp_path / name, (H, W), "photos[kitchen].objects")  # noqa: E731
     one, three = (save(tmp_path / f"{k}.png", np.uint8(255) * (LABEL == k)) for k in (1, 3))
     found = objects(("a", None), ("b", three), ("c", one))
     np.testing.assert_array_equal(found, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
