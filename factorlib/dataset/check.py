@@ -312,8 +312,7 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
                 refuse.check_path(key, light, MAPS)
                 continue
             key = f"{key}.chrome"
-            balls = list(mirror_balls(spec, name, light))
-            if not balls:
+            if not (balls := list(mirror_balls(spec, name, light))):
                 names = [obj.name for photo in shots[name] for obj in photo.objects]
                 refuse.check_known(key, light.chrome, names, "object")
             photo, ball = balls[0]
