@@ -166,22 +166,19 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             M[np.ix_(rows, rows)] += part.by_material.T @ part.by_material
             g_m[rows] += part.by_material.T @ part.residual
             C[rows, cells] += part.by_material.T @ J
-            if size > 3 * p:
-                L[photos, photos] += part.by_photo.T @ part.by_photo
-                g_l[photos] += part.by_photo.T @ part.residual
-                C[rows, photos] += part.by_material.T @ part.by_photo
-                photo_cells = part.by_photo.T @ J
-                L[photos, cells] += photo_cells
-                L[cells, photos] += photo_cells.T
+            L[photos, photos] += part.by_photo.T @ part.by_photo
+            g_l[photos] += part.by_photo.T @ part.residual
+            C[rows, photos] += part.by_material.T @ part.by_photo
+            photo_cells = part.by_photo.T @ J
+            L[photos, cells] += photo_cells
+            L[cells, photos] += photo_cells.T
         loss = illumination.fitted_loss(illumination.block.residuals(prediction.radiance), self.loss)
         factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / self.temperature
         if not materials_given:
             value += self._determinants(factor)
-            determinant = _determinant_derivatives(
-                parts, cholesky_inverse(factor[: 3 * p, : 3 * p]), places, illumination
-            )
+            determinant = _determinant_derivatives(parts, factor, places, illumination)
         scores = None if clusters is None else _scores(parts, clusters, places, size)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
@@ -253,7 +250,7 @@ def _scores(
 
 def _determinant_derivatives(
     parts: Sequence[Linearised],
-    covariance: Float[np.ndarray, "3p 3p"],
+    factor: Float[np.ndarray, "l l"],
     places: Int[np.ndarray, " k"],
     illumination: Illumination,
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
@@ -261,13 +258,14 @@ def _determinant_derivatives(
 
     Args:
         parts: Linearised observations by channel and material.
-        covariance: Σ of u.
+        factor: Lower Cholesky factor of the light's Hessian.
         places: Indices of the k material unknowns.
         illumination: Illumination of the parts.
     """
     k = len(places)
-    p = len(covariance) // 3
     light = illumination.light
+    p = int(light.free.sum())
+    covariance = cholesky_inverse(factor[: 3 * p, : 3 * p])  # Σ of u
     by_materials = np.zeros(k)
     by_materials_twice = np.zeros((k, k))
     by_light = np.zeros(light.unknowns)

@@ -81,7 +81,7 @@ def test_a_users_lights_replace_the_made_ones(tmp_path):
     assert np.unravel_index(taken[..., 0].argmax(), (16, 32)) == (1, 3)
     assert taken.mean() == pytest.approx(1)
     write_rgb_exr(tmp_path / "square.exr", np.ones((8, 8, 3)))
-    refusal("no lat-long", surroundings.read_captured_light, tmp_path / "square.exr", 8)
+    refusal("twice as wide as high", surroundings.read_captured_light, tmp_path / "square.exr", 8)
 
 
 def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
