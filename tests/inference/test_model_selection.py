@@ -9,6 +9,7 @@ import pytest
 from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.images.tone import curve
 from factorlib.inference.blocks import Noise
+from factorlib.inference.fit import reliable_observations
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import BRIGHTEST
 from factorlib.inference.identifiability import unlikely_curves
@@ -28,6 +29,8 @@ from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
+from factorlib.inference.uncertainty import Posterior, estimate_uncertainty
+from factorlib.light.prior import read_light_prior
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, sphere_normals
 from factorlib.urm.observations import Observations
 from tests.inference.made import bowls, none_held_out, rough_light
@@ -266,3 +269,17 @@ def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
     shares = [near_share(VERY_STRONG + t) for t in np.linspace(-9, 20, 2901)]
     assert shares[0] == near_share(VERY_STRONG) == 0 and shares[-1] == pytest.approx(1)
     assert (np.diff(shares) >= 0).all() and np.diff(shares).max() < 0.01
+
+
+def test_standard_errors_are_relative_to_the_reflectances_of_the_answer():
+    """The answer is in another gauge than the fit of the materials, and a factor per channel changes no relative error."""
+    problem = JointProblem(rooms(), OPERATOR)
+    solution = solve(problem, start_from_photos(len(MATERIALS)), QUICK)
+    answer, fitted = solution.point.materials, solution.materials.point.materials
+    assert np.abs(np.log(answer.specular / fitted.specular)).max() > 0.02  # the gauges differ
+    errors, _ = estimate_uncertainty(solution, problem, QUICK)
+    sample = reliable_observations(problem).subsample(QUICK.observations, QUICK.seed)
+    own, _ = Posterior(sample, solution.materials, read_light_prior()).standard_errors()
+    for name in ("diffuse", "specular"):
+        relative = getattr(errors.materials, name) / getattr(answer, name)
+        np.testing.assert_allclose(relative, getattr(own, name) / getattr(fitted, name), rtol=1e-9)
