@@ -19,7 +19,7 @@ from factorlib.inference.misfit import unexplained_shares
 from factorlib.inference.optimizer import Descent, step_light
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import insert_known
-from factorlib.inference.uncertainty import LARGEST_RELATIVE_ERROR, Posterior, project_to_gauge
+from factorlib.inference.uncertainty import LARGEST_RELATIVE_ERROR, WIDTHS, Posterior, project_to_gauge
 from factorlib.light.latlong import map_energy
 from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block, sphere_normals
@@ -342,3 +342,7 @@ def test_what_neighbours_leave_alike_is_the_share_of_the_shading_that_it_is(exac
     _, photos = unexplained(*changed(exact, radiance=flatter))
     assert photos["room0_0"].unexplained == pytest.approx((0.3 / 0.7) ** 2, rel=0.02)
     assert photos["room1_1"].unexplained < 1e-6
+
+
+def test_errors_of_well_observed_materials_are_small(fit):
+    assert (fit[3].materials.rows() < 0.2 * np.array(WIDTHS)).all()

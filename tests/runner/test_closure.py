@@ -97,3 +97,12 @@ def test_parameters_are_shown_with_those_of_bases_and_of_fields(capsys):
 def test_every_parameter_of_a_stage_says_what_it_means(stage):
     params = importlib.import_module(f"stages.{stage}").Params
     assert not [name for name, *_, text in parameters(params) if not text.endswith(".")]
+
+
+def test_a_file_that_just_changed_is_not_cached(tmp_path):
+    """A second write within the clock's step would be missed."""
+    file, hashes = tmp_path / "a", FileHashes(tmp_path / "cache")
+    file.write_text("one")
+    hashes.content(file)
+    hashes.save()
+    assert not (tmp_path / "cache").exists()

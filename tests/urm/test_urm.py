@@ -172,3 +172,8 @@ def test_rare_normals_are_all_kept_and_the_flat_seat_is_thinned():
     flat = [np.abs(s.normal - np.float32([0, -0.6, -0.8])).max(1) < 1e-6 for s in (seen, kept)]
     assert (~flat[1]).sum() == (~flat[0]).sum() == 1000
     assert flat[1].sum() <= 2000 and (kept.weight[~flat[1]] == seen.weight[~flat[0]]).all()
+
+
+def test_a_cell_of_zero_merges_nothing():
+    seen = observations()
+    assert merge(seen, 0.0) is seen
