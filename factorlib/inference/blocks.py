@@ -64,8 +64,8 @@ class RobustLoss(msgspec.Struct, frozen=True):
         return 1 / np.sqrt(1 + (residual / self.robust_scale) ** 2)
 
 
-# Beyond 3 σ of the noise model a residual is an outlier in a fit.  Models are compared with a wider loss: that of a
-# light without its highlights must count.
+# In a fit, residuals beyond 3 σ of the noise model are outliers.  Comparisons of models have a wider limit, because a
+# model that lacks a highlight has such residuals.
 FIT_LOSS = RobustLoss(3.0)
 COMPARISON_LOSS = RobustLoss(10.0)
 

@@ -22,7 +22,7 @@ constant.  With Σ = H⁻¹
     ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T,      ½ ∂ log det H/∂log e_f = Σ_{i in photo f} J_i Σ J_iᵀ / T.      (2)
 
 The latter two act on materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.optimizer`).
-Without it, all reflectances would fall: a brighter light under darker materials has the same J.  The Gauss–Newton
+Without them, all reflectances would fall: a brighter light under darker materials has the same J.  The Gauss–Newton
 Hessian of the first, Σ_i ∂J_i Σ ∂J_iᵀ, only steers the steps of a descent.  Every `HESSIAN_STRIDE`-th row therefore
 stands for its neighbours.
 
@@ -52,9 +52,8 @@ from factorlib.inference.materials import Materials
 from factorlib.light.prior import LightPrior
 
 HESSIAN_STRIDE = 8  # one row in so many enters the Hessian of the determinant
-# Standard deviation of a log exposure, relative to EXIF where a photo has it.  It decides where each photo of a light
-# shows one material, and observations leave a factor open between both: on 18 height fields in six lights, 1.0 gives
-# 25.1 dB and 3.0 gives 24.3.
+# Standard deviation of a log exposure, relative to EXIF where a photo has it.  Where every photo of a light shows one
+# material, observations do not distinguish exposure from reflectance, and this prior decides.
 EXPOSURE_DEVIATION = 1.0
 TONE_DEVIATION = 0.3  # standard deviation of a log tone exponent
 
@@ -254,7 +253,7 @@ def _determinant_derivatives(
     places: Int[np.ndarray, " k"],
     illumination: Illumination,
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
-    """Return (2) summed over channels and materials: the first part, its Hessian, and the second part.
+    """Return (2) summed over channels and materials: by materials, their Hessian, and by the light.
 
     Args:
         parts: Linearised observations by channel and material.

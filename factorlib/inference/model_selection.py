@@ -46,7 +46,7 @@ from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
-ONE_CLUSTER = 1.0  # variance of log a_i − log b_i where one cluster says nothing about it
+ONE_CLUSTER = 1.0  # variance of log a_i − log b_i in a light with one cluster, from which none can be estimated
 # Thresholds, in standard errors.  Shadows are dropped only if the evidence is clearly against them.  Tone curves need
 # clear evidence.
 CLEARLY_AGAINST = -2.0

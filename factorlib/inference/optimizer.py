@@ -10,9 +10,9 @@ L-BFGS (Nocedal 1980) with H⁻¹ as its initial inverse Hessian then minimises
 
     φ(u; θ) + prior(θ) + 2 aᵀ(θ − θ₀) + (θ − θ₀)ᵀ(D + μ diag)(θ − θ₀),     a = ½ (∂/∂θ + (du/dθ)ᵀ ∂/∂u) log det H    (2)
 
-Its gradient is exact except for the determinant, which lags behind. The minimum is accepted if it lowers (1).
-Otherwise the damping μ grows and the same factor serves again. At a fixed point the gradient of (2) is that of (1), up
-to what `factorlib.inference.likelihood` takes as constant in the determinant. Lights move to the minimum of φ alone:
+Its gradient is exact except for the determinant, which lags behind.  The minimum is accepted if it lowers (1).
+Otherwise the damping μ grows and the same factor serves again.  At a fixed point the gradient of (2) is that of (1), up
+to what `factorlib.inference.likelihood` takes as constant in the determinant.  Lights move to the minimum of φ alone:
 with the determinant in their objective, the approximation would not be Laplace's.
 
 Given the materials, each light minimises φ by itself, in the same way.

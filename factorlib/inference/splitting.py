@@ -63,7 +63,7 @@ def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions,
         evidence.append(Decision(bool(supported.any()), log_bayes_factor=total))
         if not supported.any():
             break
-        # begin with equal radiance of all cells that replace one, as `split` makes it
+        # start from the radiance of the replaced cells: the trial's lights fit the previous materials
         pairs = zip(fit.point.lights, finer, strict=True)
         selected = [pair[int(split)] for pair, split in zip(pairs, supported, strict=True)]
         fit = run.fit_and_report(phase, sample, fit.with_lights(selected), AFTER_SPLITTING)

@@ -10,10 +10,10 @@ direction take the radiance of their surroundings, and one lobe is added.  The l
     Σ_i t_i² (r_i + A_i(z) w)²                                                                                       (1)
 
 channel by channel, with t² the weight of the robust loss (0 where clipped and bright enough), A the whitened response.
-The residual is linear in w; z is searched over grids, coarse and then fine. Then cells are fitted anew around either
-lobe. The sun is kept if its light explains the observations better than cells alone, holds a share of the light, and
-is no bluer than all of it (`accept_sun`): air scatters blue light from the sun into the sky. Natural light has suns,
-so the comparison with the wide lobe rejects one only if the evidence is clearly against it (`CLEARLY_AGAINST`). All
+The residual is linear in w; z is searched over grids, coarse and then fine.  Then cells are fitted anew around either
+lobe.  The sun is kept if its light explains the observations better than cells alone, holds a share of the light, and
+is no bluer than all of it (`accept_sun`): air scatters blue light from the sun into the sky.  Natural light has suns,
+so the comparison with the wide lobe rejects one only if the evidence is clearly against it (`CLEARLY_AGAINST`).  All
 observations decide, not the held-out ones alone: a sun has five unknowns and replaces those of dozens of cells, so it
 hardly overfits.
 """

@@ -128,22 +128,31 @@ def make_view(store: Store, outputs: Mapping[str, str], gather: str | None) -> P
     """Return a folder with the files of all photos of a stage, as hard links, and create it if needed.
 
     `outputs` gives the hash of each photo's result.  The file `gather` has the contents of all `<photo>.json`.
+
+    Raises:
+        InputError: Two photos have a file of the same name.
     """
     view = store.views / hash_of({"photos": dict(outputs), "gather": gather})
     trees = {store.trees / output: stamps_of(store.trees / output) for output in sorted(set(outputs.values()))}
     files = {name: stamp for stamps in trees.values() for name, stamp in stamps.items()}
-    if {name: stamp for name, stamp in stamps_of(view).items() if name != gather} == files:
+    present = stamps_of(view)
+    if (gather is None or present.pop(gather, None)) and present == files:
         return view
     draft = store.tmp / f"view-{uuid.uuid4().hex[:8]}-{view.name}"
     for source in (tree / name for tree, stamps in trees.items() for name in stamps):
         target = draft / Path(*source.relative_to(store.trees).parts[1:])
         target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists():
+            shutil.rmtree(draft, ignore_errors=True)
+            fault = f"two photos write the same file {target.name!r}"
+            raise InputError(fault, file=source, cure="put the photo's name into the file's name")
         try:
             os.link(source, target)
         except OSError:  # no hard links on this file system
             shutil.copy2(source, target)
     if gather:
         write_text(draft / gather, json_text({photo: read_json(draft / f"{photo}.json") for photo in sorted(outputs)}))
+        (draft / gather).chmod(0o444)
     store.views.mkdir(exist_ok=True)
     store.set_aside(view)
     with contextlib.suppress(OSError):  # Another run was faster.

@@ -9,8 +9,9 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.plan import hash_of
-from factorlib.runner.results_folder import clean, collect, verify
-from factorlib.runner.store import MADE_FROM, hash_of_file
+from factorlib.runner.results_folder import clean, collect, make_view, verify
+from factorlib.runner.store import MADE_FROM, Store, hash_of_file
+from tests.refusal import refusal
 from tests.runner import toy
 from tests.runner.toy import files_of, make, make_project, new_runs, reasons, state, write
 
@@ -166,3 +167,16 @@ def test_a_shipped_file_that_was_changed_is_an_error(shipping, capsys):
         json.dumps(stored | {"files": {"../table.py": hash_of_file(folder / "table.json")}})
     )
     assert make(shipping, targets=["table"]) == 1, "a name that leads out of the folder"
+
+
+def test_two_photos_with_one_file_name_are_refused_and_a_view_without_its_gathered_file_is_made_again(tmp_path):
+    store = Store(tmp_path)
+    for photo in ("a", "b"):
+        write(store.trees / photo / f"{photo}.json", "{}")
+        write(store.trees / f"{photo}-same" / "same.json", photo)
+    store.tmp.mkdir(exist_ok=True)
+    view = make_view(store, {"a": "a", "b": "b"}, "all.json")
+    (view / "all.json").unlink()
+    assert make_view(store, {"a": "a", "b": "b"}, "all.json") == view and (view / "all.json").is_file()
+    refusal("'same.json'", make_view, store, {"a": "a-same", "b": "b-same"}, None)
+    assert [(store.trees / f"{p}-same" / "same.json").read_text() for p in "ab"] == ["a", "b"]
