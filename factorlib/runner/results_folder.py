@@ -136,7 +136,8 @@ def make_view(store: Store, outputs: Mapping[str, str], gather: str | None) -> P
     trees = {store.trees / output: stamps_of(store.trees / output) for output in sorted(set(outputs.values()))}
     files = {name: stamp for stamps in trees.values() for name, stamp in stamps.items()}
     present = stamps_of(view)
-    if (gather is None or present.pop(gather, None)) and present == files:
+    gathered = present.keys() & {gather}
+    if bool(gathered) == bool(gather) and files == {name: present[name] for name in present.keys() - gathered}:
         return view
     draft = store.tmp / f"view-{uuid.uuid4().hex[:8]}-{view.name}"
     for source in (tree / name for tree, stamps in trees.items() for name in stamps):
