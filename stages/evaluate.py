@@ -71,7 +71,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
         return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
-    resynthesis = compare_photos(lights, materials, read_photo)
+    solved, held_out = ([n for n, light in lights.items() if light.held_out == value] for value in (False, True))
+    resynthesis = compare_photos(solved, materials, read_photo)
+    predicted = compare_photos(held_out, materials, read_photo) if held_out else None
     # connected components of the graph of materials and lights
     observed = _observed_materials(resynthesis, lights)
     component = material_components({light: names for light, names in observed.items() if names})
@@ -97,7 +99,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
     if not sections["verdict"]:
         reasons["verdict"] = NO_MATERIAL
-    write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
+    write_json(
+        out / "metrics.json",
+        Metrics(set=counts, resynthesis=resynthesis, held_out=predicted, **sections, reasons=reasons),
+    )
     if sections["verdict"]:
         write_text(out / "verdict.txt", verdict_text(sections["verdict"]))
     progress(total, total)

@@ -29,7 +29,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
     metrics = run.metrics
     assert metrics is not None  # `evaluate` is an input of this stage
-    errors = metrics.resynthesis.photos
+    errors = metrics.photos
     rows = []
     tags = material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)

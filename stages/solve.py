@@ -23,6 +23,7 @@ from factorlib.inference import options
 from factorlib.inference.answer import Answer
 from factorlib.inference.blocks import Noise
 from factorlib.inference.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
+from factorlib.inference.held_out_photos import fit_lights, predicted_exposures
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.known import extract_known
@@ -40,10 +41,12 @@ from factorlib.inference.start import (
 )
 from factorlib.inference.uncertainty import estimate_uncertainty
 from factorlib.jsonfile import read_result, write_json
+from factorlib.light.lobes import Lobes
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Name
 from factorlib.results.lobe_table import write_lobes
+from factorlib.results.materials import Channels
 from factorlib.results.solution import EarlierSolution, read_earlier_solution
 from factorlib.results.surface_table import BEGINNING
 from factorlib.stage import Inputs, Progress
@@ -86,17 +89,18 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     read = count(1)
     check(params)
     declared = _known_values(params, inputs)
+    slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     files = sorted(inputs["urm"].glob("*.parquet"))
-    surface = inputs.folders.get("surface")
     photos = gather_observations(
         files,
         params.merge_degrees,
         inputs.map,
-        surface,
+        inputs.folders.get("surface"),
         lambda: progress(READING * next(read) / len(files), 1, "observations"),
     )
-    _warn(unusable_observations(photos))
-    observations = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
+    solved = [photo for photo, file in zip(photos, files, strict=True) if not slices[file.stem].held_out]
+    _warn(unusable_observations(solved))
+    observations = urm.with_exposures(urm.concatenate([photo.merged for photo in solved]), declared.exposure)
     relative = urm.relative_exposures(observations)
     earlier = (
         read_earlier_solution(inputs["start"]).with_relative_exposures(relative) if "start" in inputs.folders else None
@@ -116,8 +120,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     _warn(after_solving(answer))
     write_json(out / "materials.json", answer.material_table())
     write_json(out / "uncertainty.json", answer.uncertainty())
-    write_lobes(out / "lobes.parquet", answer.lights())
-    write_json(out / "exposures.json", answer.exposures())
+    everything = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
+    lights, exposures = _held_out_photos(params, inputs, everything, answer)
+    write_lobes(out / "lobes.parquet", answer.lights() | lights)
+    write_json(out / "exposures.json", answer.exposures() | exposures)
     write_rows(out / "convergence.parquet", Event, solution.history)
     (out / "coverage").mkdir()
     for name, coverage in coverages.items():
@@ -221,6 +227,33 @@ def _run_solver(
     )
     choices = with_earlier_decisions(params, earlier) if earlier else params
     return solve(problem, start, choices, FitRunner(unfinished, solve_progress(progress, choices)))
+
+
+def _held_out_photos(
+    params: Params, inputs: Inputs, observations: urm.Observations, answer: Answer
+) -> tuple[dict[str, Lobes], dict[str, Channels]]:
+    """Return the exposures of held-out photos, and lights that no solved photo shows.
+
+    Args:
+        params: Parameters of the stage.
+        inputs: Inputs of the stage.
+        observations: Observations of all photos.
+        answer: Solution of the other photos.
+    """
+    slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    solved_lights = set(answer.lights())
+    shared = {n: s.illumination for n, s in slices.items() if s.held_out and s.illumination in solved_lights}
+    solved = {n: s.illumination for n, s in slices.items() if not s.held_out}
+    exposures = predicted_exposures(observations, shared, solved, answer.exposures())
+    numbers = [k for k, light in enumerate(observations.illuminations) if light not in solved_lights]
+    apart = observations.take(np.isin(observations.illumination, numbers))
+    if not len(apart):
+        return {}, exposures
+    worlds = {n: np.array(s.world_from_camera) for n, s in slices.items() if s.world_from_camera is not None}
+    blocks = blocks_of_observations(apart, Noise(), held_out=0.0, world_from_camera=worlds, seed=params.seed)
+    problem = JointProblem(blocks, answer.problem.operator, inputs.map)
+    lights, exposures_of_lights = fit_lights(problem, answer.solution, params)
+    return lights, exposures | exposures_of_lights
 
 
 def _surface_start(inputs: Inputs, problem: JointProblem) -> Start | None:

@@ -70,7 +70,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if not surfaces.meshes:
         write_json(out / FILE, SurfaceTable())
         return
-    observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in photos}
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    fitted = [name for name in photos if not lights[name].held_out]
+    observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in fitted}
     attached = {
         name: photos[name].attach(np.column_stack([pixels.x, pixels.y]), surfaces)
         for name, pixels in observations.items()

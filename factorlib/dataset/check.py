@@ -66,6 +66,13 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
     with refuse.collect_fault():
+        refuse.refuse_if(
+            all(photo.held_out for photo in spec.photos),
+            "photos",
+            "every photo is held out, so that none is left to solve from",
+            "leave held_out out of at least one photo",
+        )
+    with refuse.collect_fault():
         if spec.cameras is not None:
             _check_source(spec.cameras, spec, refuse)
     with refuse.collect_fault():

@@ -152,6 +152,7 @@ class PhotoEntry(_Format, frozen=True):
         camera: known intrinsics
         objects: meshes that the photo shows
         ground: plane on which the objects stand, if it is known
+        held_out: true for a photo that is aligned and predicted, but not solved from
     """
 
     name: Name
@@ -163,6 +164,7 @@ class PhotoEntry(_Format, frozen=True):
     camera: Intrinsics | None = None
     objects: list[MeshInstance] = []
     ground: GroundEntry | None = None
+    held_out: bool = False
 
     @property
     def light(self) -> str:
@@ -356,11 +358,16 @@ class ShapesSlice(msgspec.Struct, frozen=True):
     sfm: bool = False
 
 
-class LightSlice(msgspec.Struct, frozen=True):
-    """The illumination of a photo, and the rotation that fixes it to the world (None: fixed to the camera)."""
+class LightSlice(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The illumination of a photo, and the rotation that fixes it to the world (None: fixed to the camera).
+
+    Attributes:
+        held_out: True for a photo that the results predict, and do not come from
+    """
 
     illumination: str
     world_from_camera: Mat3 | None
+    held_out: bool = False
 
 
 class GroundSlice(msgspec.Struct, frozen=True):

@@ -139,7 +139,7 @@ def _fields(value: Any, name: str) -> dict[str, Any]:
 _PHOTO_SLICES: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
     "photo": _photo,
     "objects": _objects,
-    "light": lambda dataset, photo: (schema.LightSlice(photo.light, photo.world_from_camera), []),
+    "light": lambda dataset, photo: (schema.LightSlice(photo.light, photo.world_from_camera, photo.held_out), []),
     "ground": lambda dataset, photo: (schema.GroundSlice(photo.ground), []),
 }
 _SET_SLICES: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {

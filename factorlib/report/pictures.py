@@ -92,7 +92,7 @@ def ball_rgba(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np
 
 def exposures(run: Artifacts) -> dict[str, float]:
     """Return the display exposure of each photo, which balls and reflectance maps in its light share."""
-    photos = metrics.resynthesis.photos if (metrics := run.metrics) else {}
+    photos = metrics.photos if (metrics := run.metrics) else {}
     return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
 
 

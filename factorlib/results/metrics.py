@@ -5,6 +5,7 @@ section.
 
 set          counts of photos, materials, illuminations and connected components of the observation matrix
 resynthesis  always present: `factorlib.evaluate.picture_errors`
+held_out     predictions of held-out photos, likewise; null without any
 materials    `factorlib.evaluate.truth`
 relighting   `factorlib.evaluate.relighting`
 relit_set    the relit set score of `factorlib.evaluate.relighting`
@@ -302,6 +303,12 @@ class Metrics(msgspec.Struct, frozen=True):
     reasons: dict[str, str]
     relit_set: RelitSet | None = None
     verdict: Verdict | None = None
+    held_out: ResynthesisErrors | None = None
+
+    @property
+    def photos(self) -> dict[str, PhotoErrors]:
+        """Errors of all photos, solved or held out."""
+        return self.resynthesis.photos | (self.held_out.photos if self.held_out else {})
 
 
 def read_metrics(path: str | Path) -> Metrics:

@@ -1,0 +1,79 @@
+"""Lights and exposures of held-out photos, given the materials of a solve.
+
+A held-out photo takes no part in the solve, which predicts it.  If solved photos share its light, it has that light.
+Its exposure relative to them is that of EXIF or `known`, if all of these photos have one, and else 1.  Otherwise its
+light is fitted to its own pixels with the materials fixed, so that it tests materials and shape alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from factorlib.inference.fit import FitSchedule, initial_fit
+from factorlib.inference.fit_runner import FitRunner, Solution
+from factorlib.inference.materials import Point
+from factorlib.inference.options import SolveOptions
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.start import constant_light
+from factorlib.light.lobes import Lobes
+from factorlib.results.materials import Channels, vec3
+from factorlib.urm.observations import Observations
+
+LIGHTS = FitSchedule(light_steps=10, descents=(4, 4), materials_fixed=True)
+
+
+def fit_lights(
+    problem: JointProblem, solution: Solution, options: SolveOptions
+) -> tuple[dict[str, Lobes], dict[str, Channels]]:
+    """Fit lights to the photos of a problem, with the materials of a solution, and return them with the exposures.
+
+    Args:
+        problem: Observations of held-out photos whose lights no solved photo shows.
+        solution: Result of the solver.
+        options: Options of the user.
+
+    Returns:
+        The lobes by illumination, in scene radiance, and each photo's factor on its light.
+    """
+    problem = solution.effective_problem(problem).subsample(options.observations, options.seed)
+    materials = solution.point.materials
+    start = Point(materials, [constant_light(block, materials, options.cells) for block in problem.blocks])
+    fit = FitRunner().fit("held-out photos", problem, initial_fit(start), LIGHTS)
+    lobes: dict[str, Lobes] = {}
+    exposures: dict[str, Channels] = {}
+    for block, light in zip(problem.blocks, fit.point.lights, strict=True):
+        lobes[block.name] = light.lobes.scale(block.unit)
+        factors = np.exp(light.log_exposure).tolist()
+        exposures |= {photo: (factor,) * 3 for photo, factor in zip(block.photos, factors, strict=True)}
+    return lobes, exposures
+
+
+def predicted_exposures(
+    observations: Observations,
+    held_out: Mapping[str, str],
+    solved: Mapping[str, str],
+    exposures: Mapping[str, Channels],
+) -> dict[str, Channels]:
+    """Return the exposures of held-out photos of solved lights.
+
+    They are the geometric mean over the solved photos of a light, of each one's exposure times the ratio of both
+    exposures by EXIF.
+
+    Args:
+        observations: Observations of all photos, with their exposures by EXIF.
+        held_out: Illumination by held-out photo.
+        solved: Illumination by solved photo.
+        exposures: Factor of each solved photo on its light.
+    """
+    exif = dict(zip(observations.photos, observations.exposures or (None,) * len(observations.photos), strict=True))
+    result = {}
+    for name, light in held_out.items():
+        references = [photo for photo, its in solved.items() if its == light and photo in exposures]
+        known = [exif.get(photo) or np.nan for photo in [name, *references]]
+        ratios = np.nan_to_num(known[0] / np.array(known[1:]), nan=1.0)
+        if references:
+            logs = [np.log(exposures[p]) + np.log(ratio) for p, ratio in zip(references, ratios, strict=True)]
+            result[name] = vec3(np.exp(np.mean(logs, axis=0)))
+    return result
