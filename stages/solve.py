@@ -108,7 +108,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     problem = _build_problem(params, inputs, declared, observations, relative)
     _warn(before_solving(names, observations.photos, problem))
     solution = _run_solver(params, problem, earlier, inputs, partial(_share, progress))
-    systems = 2 * len(problem.blocks)
+    systems = len(problem.blocks) * (1 if params.solver == "joint" else 2)
     counter = count(1)
 
     def tick() -> None:

@@ -69,6 +69,10 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
             name: table.attach_errors(table.Reflectance(*row), stderr[name], kind, self._known_parts(m))
             for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
         }
+        if self.solver == "joint":
+            for name, shares in zip(self.names, self.errors.prior_share, strict=True):
+                parts = float(shares[:3].mean()), float(shares[3:6].mean()), float(shares[6])
+                solved[name] = msgspec.structs.replace(solved[name], prior_share=table.PriorShares(*parts))
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
         absolute = self.solution.interreflection.accepted

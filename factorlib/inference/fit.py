@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.inference.blocks import FIT_LOSS, Block
+from factorlib.inference.exposures import balance_exposures
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
@@ -146,7 +147,8 @@ def fit_problem(
         if schedule.materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
-            state = descent.descend_jointly(state, iterations)
+            theta, balanced = balance_exposures(state.theta, state.likelihoods, prior_on_materials, problem.known)
+            state = descent.descend_jointly(state._replace(theta=theta, likelihoods=balanced), iterations)
     if not schedule.materials_fixed:
         materials = materials_from_unknowns(state.theta)
     lights = [descended.light for descended in state.likelihoods]

@@ -17,7 +17,7 @@ import torch
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.inference.fit import Fit, FitSchedule, fit_problem
-from factorlib.inference.materials import Point
+from factorlib.inference.materials import MaterialErrors, Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.prior import LightPrior, read_light_prior
@@ -59,7 +59,11 @@ PHASES = {
     "materials and lights": (11, 7),
 }
 SPLITTING = (7, 9)
-LAST = {"lights": (3, 14), "suns": (4, 10)}
+LAST = {"prior": (6, 0.5), "lights": (3, 14), "suns": (4, 10)}
+
+
+# Factor on the number of observations where materials are given: +0.25 dB on data/eames, +0.27 on the made set of 101.
+LIGHT_OBSERVATION_FACTOR = 2
 
 
 def ignore_event(event: Event) -> None:
@@ -79,6 +83,7 @@ class SolveState(msgspec.Struct, frozen=True):
         splitting: Decision on each splitting of the lights' cells.
         suns: Decision on each light's sun.
         observations: Largest number of a light's observations that materials are fitted to.
+        errors: Standard errors of the materials of `fit`; empty before they are estimated.
     """
 
     fit: Fit
@@ -90,6 +95,12 @@ class SolveState(msgspec.Struct, frozen=True):
     splitting: list[Decision] = []
     suns: list[Decision] = []
     observations: int = 0
+    errors: MaterialErrors = MaterialErrors()
+
+    @property
+    def light_observations(self) -> int:
+        """Largest number of a light's observations that it is fitted to with the materials fixed."""
+        return LIGHT_OBSERVATION_FACTOR * self.observations
 
     def with_fit(self, fit: Fit, **decisions: list[Decision]) -> SolveState:
         """Return the state after a step that fitted materials and lights."""
@@ -246,6 +257,10 @@ class FitRunner:
         held_out = problem.held_out_loss(fit.point)
         self._record(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
         return fit
+
+    def tick(self, phase: str) -> None:
+        """Report progress of a phase that fits nothing."""
+        self.report(msgspec.structs.replace(self.history[-1], phase=phase))
 
     def _record(self, event: Event) -> None:
         """Remember and report an event."""

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.inference.answer import Answer
 from factorlib.inference.blocks import Block
+from factorlib.inference.exposures import material_groups
 from factorlib.inference.gauge import LEAST_ENERGY, connected_components, has_free_factor
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.observed import PhotoObservations
@@ -65,6 +66,16 @@ def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointPr
             f"compared: {groups}. An object that is left out of the solve may link them, once its pose is good; else "
             "a photo that shows a material of each would"
         )
+    group = material_groups(problem.blocks, len(names), problem.known)
+    for component in linked:
+        apart = sorted({int(group[m]) for m in component.materials})
+        if len(apart) > 1 and problem.known.free_factors(*component) == 3:
+            members = "; ".join(", ".join(n for m, n in enumerate(names) if group[m] == g) for g in apart)
+            sentences.append(
+                "photos of one light show different materials, so that a longer exposure and a brighter material look "
+                f"alike: the relative brightness of {members} rests on the assumption of similar exposures. If the "
+                "camera's exposure was fixed, write `known: {exposure: {<photo>: 0, …}}` for all photos of a light"
+            )
     return sentences + undetermined_by_observations(names, problem)
 
 

@@ -7,6 +7,7 @@ distances   Marginal likelihoods choose distances of lights.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
 splitting   The cells with most of a light's energy split in four while its marginal likelihood rises
             (`factorlib.inference.splitting`).  Light sharper than a cell makes materials look smoother.
+prior       The errors of the model give the prior on materials its say (`factorlib.inference.material_posterior`).
 lights      Given the materials, lights are fitted to observations of any confidence.
 suns        Each light is compared with one that has a sun in place of its brightest cells (`factorlib.inference.suns`).
 
@@ -16,6 +17,7 @@ Every step is a function of the previous state, and `FitRunner` saves each state
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 
@@ -34,10 +36,9 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.splitting import split_cells
 from factorlib.inference.start import Start, insert_known, refine_cells
 from factorlib.inference.suns import select_suns
+from factorlib.inference.uncertainty import Posterior
 
 MATERIALS = FitSchedule(light_steps=2, descents=(5, 4))
-# Factor on the number of observations where materials are given: +0.25 dB on data/eames, +0.27 on the made set of 101.
-LIGHT_OBSERVATION_FACTOR = 2
 LIGHTS = FitSchedule(descents=(0, 2, 2), least_temperature=0.1, materials_fixed=True)
 
 
@@ -62,8 +63,7 @@ class SolveRequest(msgspec.Struct, frozen=True):
 
     def light_problem(self, state: SolveState) -> JointProblem:
         """Return the observations of any confidence that lights are fitted to, under the chosen effects."""
-        count = LIGHT_OBSERVATION_FACTOR * state.observations
-        return state.effective_problem(self.problem).subsample(count, self.options.seed)
+        return state.effective_problem(self.problem).subsample(state.light_observations, self.options.seed)
 
 
 def solve(
@@ -124,6 +124,15 @@ def choose_splittings(request: SolveRequest, state: SolveState) -> SolveState:
     return split_cells(request.reliable_problem(state), state, request.options, request.run)
 
 
+def apply_prior(request: SolveRequest, state: SolveState) -> SolveState:
+    """Combine the fitted materials with the prior on materials, by the errors of the model."""
+    sample = request.reliable_problem(state).subsample(state.observations, request.options.seed)
+    posterior = Posterior(sample, state.fit, request.run.prior, partial(request.run.tick, "prior"))
+    materials, errors = posterior.with_prior()
+    fit = msgspec.structs.replace(state.fit, point=Point(materials, state.fit.point.lights))
+    return msgspec.structs.replace(state, fit=fit, errors=errors)
+
+
 def fit_lights(request: SolveRequest, state: SolveState) -> SolveState:
     """Fit the lights to observations of any confidence, with the materials fixed."""
     fit = request.run.fit_and_report("lights", request.light_problem(state), state.fit, LIGHTS)
@@ -142,6 +151,7 @@ STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
     "distances": choose_distances,
     "materials": fit_materials,
     "splitting": choose_splittings,
+    "prior": apply_prior,
     "lights": fit_lights,
     "suns": choose_suns,
 }

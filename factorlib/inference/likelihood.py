@@ -121,6 +121,11 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         """Light of this likelihood."""
         return self.illumination.light
 
+    @property
+    def log_radiance(self) -> Float[np.ndarray, "3 p"]:
+        """u, log radiance of each cell, channel by channel."""
+        return np.log(np.maximum(self.light.weight.T, DARKEST)) - self.log_peaks
+
     def with_point(self, light: Light | None = None, materials: Materials | None = None) -> LightLikelihood:
         """Return the same likelihood at another light or other materials, with the same table."""
         current = self.illumination
@@ -192,7 +197,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 
     def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
         """Return uᵀQu plus the Gaussian priors of exposures and tones, and half the gradient."""
-        u = (np.log(np.maximum(self.light.weight.T, DARKEST)) - self.log_peaks).reshape(-1)
+        u = self.log_radiance.reshape(-1)
         photo_values, width = self._photo_unknowns()
         slope = self.precision @ u
         free = np.tile(self.light.free, 3)

@@ -51,6 +51,20 @@ class Materials(msgspec.Struct, frozen=True):
         return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, 6], *ROUGHNESS))
 
 
+class MaterialErrors(msgspec.Struct, frozen=True):
+    """Standard errors of the material unknowns.
+
+    Attributes:
+        materials: Standard error of every unknown.
+        deviation: Standard deviation of the residuals, in σ of the noise model.
+        prior_share: Share of every unknown that comes from the prior, 0 to 1.
+    """
+
+    materials: Materials = Materials(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    deviation: float = 0.0
+    prior_share: Float[np.ndarray, "m 7"] = np.zeros((0, 7))
+
+
 class Point(msgspec.Struct, frozen=True):
     """Materials of a problem, and one light for each of its blocks, in their order."""
 

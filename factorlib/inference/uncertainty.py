@@ -34,8 +34,8 @@ Lights      Given the materials, log radiance of a light has the covariance Σ =
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import norm
@@ -46,10 +46,10 @@ from factorlib.inference.fit import Fit, Hyperparameters, light_likelihood, reli
 from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.joint_solver import LIGHT_OBSERVATION_FACTOR
 from factorlib.inference.likelihood import System, cholesky_factor, cholesky_inverse, solve_cholesky
+from factorlib.inference.material_posterior import material_posterior
 from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
-from factorlib.inference.materials import ROUGHNESS, Materials, Point
+from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, MaterialErrors, Materials, Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
@@ -69,18 +69,6 @@ COVERAGE_ROWS = 32  # rows of the maps of a light's relative standard errors
 LARGEST_RELATIVE_ERROR = 1000.0  # upper limit in these maps
 
 
-class MaterialErrors(NamedTuple):
-    """Standard errors of the material unknowns.
-
-    Attributes:
-        materials: Standard error of every unknown.
-        deviation: Standard deviation of the residuals, in σ of the noise model.
-    """
-
-    materials: Materials
-    deviation: float
-
-
 def estimate_uncertainty(
     solution: Solution, problem: JointProblem, options: SolveOptions, tick: Callable[[], None] = lambda: None
 ) -> tuple[MaterialErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
@@ -90,16 +78,19 @@ def estimate_uncertainty(
         solution: Result of the solver.
         problem: All observations of the solve.
         options: Options of the user.
-        tick: Called after each of two systems for each light.
+        tick: Called after each system of a light, one or (for the paper's solver) two a light.
     """
     problem = solution.effective_problem(problem)
     prior = read_light_prior()
-    material_sample = reliable_observations(problem).subsample(solution.observations, options.seed)
-    light_sample = problem.subsample(LIGHT_OBSERVATION_FACTOR * solution.observations, options.seed)
-    errors_of_fit, deviation = Posterior(material_sample, solution.materials, prior, tick).standard_errors()
-    diffuse = errors_of_fit.diffuse * solution.point.materials.diffuse / solution.materials.point.materials.diffuse
-    specular = errors_of_fit.specular * solution.point.materials.specular / solution.materials.point.materials.specular
-    errors = MaterialErrors(Materials(diffuse, specular, errors_of_fit.roughness), deviation)
+    errors = solution.errors
+    if not len(errors.materials):  # of the paper's solver, which has no prior
+        sample = reliable_observations(problem).subsample(solution.observations, options.seed)
+        errors = Posterior(sample, solution.materials, prior, tick).standard_errors()
+    # from the gauge of the fit to that of the answer
+    fitted = np.maximum(solution.fit.point.materials.rows(), LEAST_REFLECTANCE)
+    in_gauge = errors.materials.rows() * (solution.point.materials.rows() / fitted)
+    errors = msgspec.structs.replace(errors, materials=Materials.from_rows(in_gauge))
+    light_sample = problem.subsample(solution.light_observations, options.seed)
     return errors, Posterior(light_sample, solution.fit, prior, tick).relative_standard_errors()
 
 
@@ -135,20 +126,46 @@ class Posterior:
         illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
-    def standard_errors(self) -> MaterialErrors:
-        """Return the standard error of every material unknown."""
+    @property
+    def values(self) -> Float[np.ndarray, "m 7"]:
+        """Reflectances, and 1 for roughness: the derivatives of the unknowns of the answer by those of the fit."""
+        return np.column_stack([self.materials.diffuse, self.materials.specular, np.ones(len(self.materials))])
+
+    def covariance(self) -> tuple[Float[np.ndarray, "k k"], float]:
+        """Return the covariance of reflectances and roughnesses, and the deviation of the residuals."""
         materials = self.materials
-        values = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
-        by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
-        # S and s_k, from logarithms to reflectances
-        precision, scores = information(self.systems(with_scores=True), len(by_log))
-        scores = [light_scores * by_log for light_scores in scores]
-        variance = largest_variance(precision * np.outer(by_log, by_log), scores, materials, self.problem)
+        values = self.values.reshape(-1)
+        # S and s_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
+        precision, scores = information(self.systems(with_scores=True), len(values))
+        scores = [light_scores / values for light_scores in scores]
+        covariance = widest_covariance(precision / np.outer(values, values), scores, materials, self.problem)
         deviation = residual_deviation(self.problem, self.fit.point)
-        variance += ((deviation * MODEL_ERROR * values) ** 2).reshape(-1)
-        variance = np.where(self.problem.known.free(len(materials)), variance, 0.0)
+        covariance += np.diag((deviation * np.tile(MODEL_ERROR, len(materials)) * values) ** 2)
+        free = self.problem.known.free(len(materials))
+        return np.where(np.outer(free, free), covariance, 0.0), deviation
+
+    def standard_errors(self) -> MaterialErrors:
+        """Return the standard error of every material unknown by the observations alone."""
+        covariance, deviation = self.covariance()
         # an error is at most the width of its unknown's range
-        return MaterialErrors(Materials.from_rows(np.minimum(np.sqrt(variance).reshape(-1, 7), WIDTHS)), deviation)
+        errors = np.minimum(np.sqrt(np.diag(covariance)).reshape(-1, 7), WIDTHS)
+        return MaterialErrors(Materials.from_rows(errors), deviation, np.zeros_like(errors))
+
+    def with_prior(self) -> tuple[Materials, MaterialErrors]:
+        """Return the materials by `factorlib.inference.material_posterior`, and their standard errors."""
+        covariance, deviation = self.covariance()
+        values = self.values
+        unknowns = material_unknowns(self.materials)
+        free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
+        posteriors = []
+        for m, theta in enumerate(unknowns):
+            of_material = covariance[7 * m : 7 * m + 7, 7 * m : 7 * m + 7]
+            posteriors.append(material_posterior(theta, of_material / np.outer(values[m], values[m]), free[m]))
+        materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
+        scale = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
+        errors = np.minimum(np.array([posterior.deviation for posterior in posteriors]) * scale, WIDTHS)
+        shares = np.array([posterior.prior_share for posterior in posteriors])
+        return materials, MaterialErrors(Materials.from_rows(errors), deviation, shares)
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
         """Return maps of each light's standard error relative to its mean radiance, by illumination.
@@ -217,13 +234,15 @@ def residual_deviation(problem: JointProblem, point: Point) -> float:
     return robust_deviation(residuals if len(residuals) else np.concatenate([residual for residual, _ in pairs]))
 
 
-def largest_variance(
+def widest_covariance(
     information: Float[np.ndarray, "k k"],
     scores: Sequence[Float[np.ndarray, "g k"]],
     materials: Materials,
     problem: JointProblem,
-) -> Float[np.ndarray, " k"]:
-    """Return the largest of three variances of each unknown, in the gauge; 0 for known ones.
+) -> Float[np.ndarray, "k k"]:
+    """Return the covariance in the gauge with the largest of three variances of each unknown; 0 for known ones.
+
+    Correlations are those of independent noise.
 
     The data may leave unknowns undetermined, such as the roughness of a Lambertian material, or a trade of one unknown
     for another.  The variance of such an unknown is that of the width of its range, which counts as one more
@@ -247,9 +266,12 @@ def largest_variance(
     inverse[np.ix_(free, free)] = cholesky_inverse(cholesky_factor(regularised)) / scales
     light_sums = np.array([s.sum(0) for s in scores])
     covariances = inverse, sandwich(inverse, np.vstack(scores)), sandwich(inverse, light_sums)
-    return np.max(
-        [np.diag(project_to_gauge(covariance, materials, problem)) for covariance in covariances], axis=0
-    ).clip(0)
+    in_gauge = [project_to_gauge(covariance, materials, problem) for covariance in covariances]
+    variances = np.array([np.diag(covariance) for covariance in in_gauge]).clip(0)
+    scale = np.sqrt(variances.max(0) / np.maximum(variances[0], 1e-300))
+    covariance = in_gauge[0] * np.outer(scale, scale)
+    np.fill_diagonal(covariance, variances.max(0))
+    return covariance
 
 
 def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]) -> Float[np.ndarray, "k k"]:

@@ -17,6 +17,7 @@ from factorlib.jsonfile import read_result
 Vec3 = tuple[float, float, float]
 AtLeast0 = Annotated[float, msgspec.Meta(ge=0)]
 Channels = tuple[AtLeast0, AtLeast0, AtLeast0]  # linear Rec. 709
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
@@ -69,6 +70,14 @@ class Kind(msgspec.Struct, frozen=True):
     probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
+class PriorShares(msgspec.Struct, frozen=True):
+    """Shares of a reflectance that come from the prior on materials, 0 (observations alone) to 1."""
+
+    diffuse: Share
+    specular: Share
+    roughness: Share
+
+
 class SolvedMaterial(Reflectance, frozen=True):
     """A solved material with its standard errors.
 
@@ -76,12 +85,14 @@ class SolvedMaterial(Reflectance, frozen=True):
         alpha: α = roughness², for other programs
         kind: class of the material, if the solver has classes
         given: parts that were known beforehand, with standard errors of 0
+        prior_share: shares that come from the prior, if the solver has one
     """
 
     alpha: AtLeast0
     stderr: StandardErrors
     kind: Kind | UnsetType = UNSET
     given: list[str] | UnsetType = UNSET
+    prior_share: PriorShares | UnsetType = UNSET
 
     @property
     def reflectance(self) -> Reflectance:

@@ -1,0 +1,125 @@
+"""Balance of exposures against reflectances, where photos of one light show different materials.
+
+Materials that one photo shows are linked: their relative reflectance is observed.  So are those of all photos of a
+light whose exposures are known.  Let g number the groups of linked materials.  All reflectances of a group times f_g,
+all lights over the f_g of their first photo, and the exposures of their other photos over their own f_g,
+
+    k → f_g k,      w → w/f_g₁,      e → e f_g₁/f_g,                                                                 (1)
+
+predict the same radiance (but for interreflection), so that the priors alone choose f.  A descent of the whole
+objective hardly moves along (1), because its tolerance is a share of a value that misfits dominate.  Here the priors of
+exposures, lights and materials are minimised over log f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import minimize
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components as components_of_graph
+
+from factorlib.inference.blocks import Block
+from factorlib.inference.gauge import connected_components
+from factorlib.inference.known import KnownValues
+from factorlib.inference.likelihood import EXPOSURE_DEVIATION, LightLikelihood
+from factorlib.inference.material_prior import MaterialPrior, materials_from_unknowns
+from factorlib.inference.materials import Materials
+
+
+def balance_exposures(
+    theta: Float[np.ndarray, "m 7"], likelihoods: Sequence[LightLikelihood], prior: MaterialPrior, known: KnownValues
+) -> tuple[Float[np.ndarray, "m 7"], list[LightLikelihood]]:
+    """Return material unknowns and lights after the move (1) that the priors favour.
+
+    Components with known materials or lights, and those of one group, stay as they are.
+
+    Args:
+        theta: log k_d, log k_s and roughness.
+        likelihoods: Likelihood of each light.
+        prior: Prior on materials.
+        known: Known values.
+    """
+    blocks = [likelihood.illumination.block for likelihood in likelihoods]
+    group = material_groups(blocks, len(theta), known)
+    movable = np.zeros(len(theta), bool)
+    for members, lights in connected_components(blocks, len(theta)):
+        rows = list(members)
+        movable[rows] = len(set(group[rows])) > 1 and known.free_factors(members, lights) == 3
+    moving = np.unique(group[movable])
+    if not len(moving):
+        return theta, list(likelihoods)
+    terms = [LightTerms(likelihood, group) for likelihood in likelihoods]
+
+    def move(logs: Float[np.ndarray, " g"]) -> tuple[Float[np.ndarray, "m 7"], Float[np.ndarray, " m"]]:
+        """Return the unknowns after a move, and log f of every group."""
+        log_factors = np.zeros(len(theta))
+        log_factors[moving] = logs
+        moved = theta.copy()
+        moved[:, :6] += log_factors[group][:, None]
+        return moved, log_factors
+
+    def energy(logs: Float[np.ndarray, " g"]) -> float:
+        """Return the sum of the priors after a move."""
+        moved, log_factors = move(logs)
+        return prior.evaluate(moved).value + sum(term.energy(log_factors) for term in terms)
+
+    moved, log_factors = move(minimize(energy, np.zeros(len(moving))).x)
+    materials = materials_from_unknowns(moved)
+    return moved, [term.moved(log_factors, materials) for term in terms]
+
+
+class LightTerms:
+    """Prior of one light and its exposures along (1).
+
+    Args:
+        likelihood: Likelihood of the light.
+        group: Group of each material.
+    """
+
+    def __init__(self, likelihood: LightLikelihood, group: Int[np.ndarray, " m"]):
+        self.likelihood = likelihood
+        block = likelihood.illumination.block
+        self.log_exposure = likelihood.light.log_exposure
+        # group of each photo; photos without observations are of the first's
+        self.groups = np.full(len(block.photos), group[block.material[0]])
+        self.groups[block.photo] = group[block.material]
+        # uᵀQu is a parabola in the shift of u
+        u = likelihood.log_radiance.reshape(-1)
+        rows = likelihood.precision.sum(0)
+        self.slope = float(rows @ u)
+        self.curvature = float(rows.sum())
+
+    def energy(self, log_factors: Float[np.ndarray, " m"]) -> float:
+        """Return the change of uᵀQu, and the prior of the exposures, after a move."""
+        shift = -log_factors[self.groups[0]]
+        exposures = self._exposures(log_factors)
+        return shift * (2 * self.slope + shift * self.curvature) + float(np.sum((exposures / EXPOSURE_DEVIATION) ** 2))
+
+    def moved(self, log_factors: Float[np.ndarray, " m"], materials: Materials) -> LightLikelihood:
+        """Return the likelihood after a move."""
+        light = self.likelihood.light
+        weight = light.weight / np.exp(log_factors[self.groups[0]])
+        light = msgspec.structs.replace(light, weight=weight, log_exposure=self._exposures(log_factors))
+        return self.likelihood.with_point(light, materials)
+
+    def _exposures(self, log_factors: Float[np.ndarray, " m"]) -> Float[np.ndarray, " f"]:
+        """Return the log exposures after a move."""
+        return self.log_exposure + log_factors[self.groups[0]] - log_factors[self.groups]
+
+
+def material_groups(blocks: Sequence[Block], count: int, known: KnownValues) -> Int[np.ndarray, " m"]:
+    """Return the number of the group of each of `count` materials, from 0."""
+    pairs = [np.zeros((0, 2), int)]
+    photos = 0
+    for block in blocks:
+        photo = block.photo * (block.name not in known.exposures)
+        pairs.append(np.unique(np.column_stack([block.material, count + photos + photo]), axis=0))
+        photos += len(block.photos)
+    material, node = np.vstack(pairs).T
+    size = count + photos
+    graph = coo_array((np.ones(len(material)), (material, node)), shape=(size, size))
+    return components_of_graph(graph, directed=False)[1][:count]

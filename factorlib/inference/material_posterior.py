@@ -1,0 +1,79 @@
+"""Posterior of each material from its estimate, the errors of the model, and the prior on materials.
+
+A fit weighs observations as if the model were exact but for independent noise, so that a wrong mesh can outweigh any
+prior: stone becomes enamel.  Once the errors of the model are known (`factorlib.inference.uncertainty`), each material
+is estimated again.  With θ = (log k_d, log k_s, roughness), θ̂ the fit and Σ its covariance, errors of the model
+included, it minimises
+
+    (θ − θ̂)ᵀ Σ⁻¹ (θ − θ̂) − 2 log p(log k_s, roughness)                                                              (1)
+
+with p the classes of `factorlib.inference.material_prior`.  Σ couples k_d to k_s, so k_d follows.  Its covariance is
+(Σ⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one less the
+ratio of its two variances.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
+
+from factorlib.inference.material_prior import Mixture, shipped_classes
+from factorlib.inference.materials import ROUGHNESS
+
+BOUNDS = [(None, None)] * 6 + [ROUGHNESS]
+
+
+class MaterialPosterior(NamedTuple):
+    """Posterior of one material.
+
+    Attributes:
+        theta: Minimum of (1).
+        deviation: Standard deviation of each unknown.
+        prior_share: Share of each unknown that comes from the prior, 0 to 1.
+    """
+
+    theta: Float[np.ndarray, "7"]
+    deviation: Float[np.ndarray, "7"]
+    prior_share: Float[np.ndarray, "7"]
+
+
+def material_posterior(
+    theta: Float[np.ndarray, "7"], covariance: Float[np.ndarray, "7 7"], free: Bool[np.ndarray, "7"]
+) -> MaterialPosterior:
+    """Return the posterior of one material by (1).
+
+    Args:
+        theta: θ̂.
+        covariance: Σ.
+        free: Mask of the unknowns that are not known.
+    """
+    deviation = np.where(free, np.sqrt(np.diag(covariance)), 0.0)
+    if not free[3:].any():
+        return MaterialPosterior(theta, deviation, np.zeros(7))
+    mixture = Mixture(shipped_classes().classes)
+    precision = np.linalg.inv(covariance[np.ix_(free, free)])
+    bounds = [bound for bound, is_free in zip(BOUNDS, free, strict=True) if is_free]
+
+    def objective(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return (1) and its gradient by the free unknowns."""
+        full = theta.copy()
+        full[free] = unknowns
+        off = unknowns - theta[free]
+        energy, slope, _, _ = mixture.evaluate(full[3:])
+        gradient = np.append(np.zeros(3), slope)[free]
+        return float(off @ precision @ off) + energy, 2 * (precision @ off + gradient)
+
+    # (1) has several minima: one start is the fit, the others have the means of the classes
+    starts = [theta, *(np.append(theta[:3], mean) for mean in mixture.mean)]
+    minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
+    result = theta.copy()
+    result[free] = min(minima, key=lambda minimum: minimum.fun).x
+    by_prior = np.zeros((7, 7))
+    by_prior[3:, 3:] = mixture.evaluate(result[3:])[2]
+    variance = np.zeros(7)
+    variance[free] = np.diag(np.linalg.inv(precision + by_prior[np.ix_(free, free)]))
+    share = 1 - variance / np.where(free, deviation**2, 1.0)
+    return MaterialPosterior(result, np.sqrt(variance), np.where(free, share, 0.0).clip(0, 1))
