@@ -133,7 +133,7 @@ def decode_photo(
         encoding: Encoding of its values; None takes what the format implies.
         factor: Factor of the downsampling.
         path: File to name in warnings.
-        look: Function of all linear values of the file, some rows at a time, before they are averaged.
+        look: Called with the linear values of the file, some rows at a time, before they are averaged.
     """
     encoding = encoding or opened.encoding
     height, width = (n // factor for n in (opened.height, opened.width))

@@ -191,7 +191,7 @@ def read_coco(
             raise InputError(fault, file=path, key=place, cure="add the category, or correct category_id")
         if name not in materials:
             cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
-            raise InputError(f"category {name!r} is no material", file=path, key=place, cure=cure)
+            raise InputError(f"category {name!r} is not a material", file=path, key=place, cure=cure)
         segmentations.setdefault(name, []).append((f"{place}.segmentation", annotation.segmentation))
     masks = {}
     length = 0.0  # of all outlines
@@ -202,7 +202,9 @@ def read_coco(
             shapes += [(place, counts) for counts in runs]
             length += longer
             if length > LONGEST_TOGETHER * sum(size):
-                raise InputError(f"all outlines together are {length:.3g} px long", file=path, key=place, cure=SIMPLER)
+                most = LONGEST_TOGETHER * sum(size)
+                fault = f"all outlines together are {length:.3g} pixels long; at most {most:,} are read"
+                raise InputError(fault, file=path, key=place, cure=SIMPLER)
         masks[name] = _union(shapes, size, path)
     return masks
 
@@ -236,7 +238,7 @@ def run_lengths(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
     value = shift = 0
     for code in counts.encode("ascii") if isinstance(counts, str) else ():
         if not 48 <= code < 112 or shift >= 5 * MOST_DIGITS:
-            raise ValueError("it is no compressed RLE, or a run is longer than any picture")
+            raise ValueError("it is not a compressed RLE, or a run is longer than any picture")
         value |= (code - 48 & 31) << shift
         shift += 5
         if not code - 48 & 32:  # the last character of a run, whose highest bit is the sign
@@ -296,7 +298,7 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         corners = np.array(polygon)
         cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
         if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
-            fault = "is no polygon"
+            fault = "is not a polygon"
         elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
             fault = f"has corners outside the image of {_wh(shape)} pixels"
             cure = "clip it to the image; if it was drawn at another size, export it at the photo's own size"

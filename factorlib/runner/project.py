@@ -403,7 +403,7 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
         stage, *names = target.split(".")
         if not equals or not all(names) or not 0 < len(names) <= DEEPEST:
             cure = 'write stage.parameter=value, as in SET="solve.cells=800"'
-            raise InputError(f"{one_line(word)!r} is no setting", key="SET", cure=cure)
+            raise InputError(f"{one_line(word)!r} is not a setting", key="SET", cure=cure)
         if stage not in stages:
             raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
         table = params = dict(stages[stage].params)

@@ -298,7 +298,11 @@ def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
     page = (project.build / "compare" / "before-set" / "index.html").read_text()
     assert html.escape("upper: parameter times: default -> 2") in page and page.count("<li>") == 1
     refusal(
-        "is no folder of results\n  known are: 'set'", verbs.compare, project, tmp_path / "before", tmp_path / "nothing"
+        "is not a folder of results\n  known are: 'set'",
+        verbs.compare,
+        project,
+        tmp_path / "before",
+        tmp_path / "nothing",
     )
     project = Project(toy.make_project(tmp_path / "new").root, Provider(("photo",), toy.read))  # where nothing was run
     refusal("make all DATASET=<name> makes one", verbs.compare, project, tmp_path / "a", tmp_path / "b")

@@ -294,7 +294,7 @@ PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: tcp://a:1\nsta
     (ON_DASK, "", "tcp://a:1"),
     (ON_DASK, "executor=processes", "processes"),
     (PLAIN, "executor=dusk", "SET executor=dusk: "),
-    (PLAIN, "exectuor=dask", "SET: 'exectuor=dask' is no setting"),
+    (PLAIN, "exectuor=dask", "SET: 'exectuor=dask' is not a setting"),
     ("executor: dusk\n" + PLAIN, "", "pipeline.yaml:1: executor: "),
     ("executer: dask\n" + PLAIN, "", "did you mean 'executor'?"),
 ])  # fmt: skip

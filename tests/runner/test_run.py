@@ -262,7 +262,7 @@ def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsy
     assert wait_until(lambda: sleeping(project))
     verbs.show_status(project, verbs.Request("set"))
     assert re.search(r"^upper +[12] running", capsys.readouterr().out)
-    with pytest.raises(InputError, match="a run is going on"):
+    with pytest.raises(InputError, match="a run is using this store"):
         collect(project)
     second = start(project)
     waits = any("another run is making it" in line for line in second.stdout)
