@@ -137,10 +137,10 @@ def test_truth_is_its_own_slice_and_a_warning_where_it_is_missing(folder, caplog
     assert truth.files == ["truth/garden.exr"]
     assert msgspec.convert(truth.facts, schema.TruthFile).materials["red"].roughness == 0.3
     assert all(dataset_slice(plain, name) == dataset_slice(dataset, name) for name in SLICES if name != "truth")
-    for gone in ("truth/garden.exr", "truth/truth.yaml"):
-        (folder / gone).unlink()
+    for missing in ("truth/garden.exr", "truth/truth.yaml"):
+        (folder / missing).unlink()
         with caplog.at_level(logging.WARNING):
-            assert dataset_slice(read_dataset(folder), "truth").facts is None and gone in caplog.text
+            assert dataset_slice(read_dataset(folder), "truth").facts is None and missing in caplog.text
 
 
 @pytest.mark.parametrize("truth, key, cure", [

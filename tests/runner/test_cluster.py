@@ -301,7 +301,7 @@ PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: tcp://a:1\nsta
 def test_where_steps_run_stands_in_pipeline_yaml_and_a_setting_replaces_it(tmp_path, text, setting, expected):
     write(tmp_path / "pipeline.yaml", text)
     try:
-        found = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting]).executor
+        result = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting]).executor
     except InputError as error:
-        found = str(error)
-    assert expected in found
+        result = str(error)
+    assert expected in result
