@@ -115,7 +115,7 @@ def generate(
         lat_longs: Light maps of the user, which replace the generated lights.
         parameters: Options of the set.
         progress: Called with the number of finished photos, their total, and the current photo's name.
-        shots: Photos.
+        shots: Shots to render, one for each photo.
     """
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)

@@ -162,7 +162,7 @@ SPEED = Study(
 
 # ── parts ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-# label, what is off, of `CHANGES`, parameters of the stage
+# label, what is off, of `studies.steps.parts.CHANGES`, parameters of the stage
 WITHOUT: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "as-it-is": ("as it is", "", "", {}),
     "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
