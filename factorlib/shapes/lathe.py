@@ -351,7 +351,7 @@ def mesh_profile(profile: Profile) -> Triangles:
     if len(profile) < 3:
         raise InputError(
             "no body of revolution fits into its outlines",
-            cure="check that its masks and poses belong to one object, and that it is round about the y axis of its poses",
+            cure="check that its masks and poses belong to one object, which is round about the y axis of its poses",
         )
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     height = profile[::-1, :1]  # by descending height
