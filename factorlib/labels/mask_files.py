@@ -162,7 +162,9 @@ class Coco(msgspec.Struct, frozen=True):
 def read_coco(
     path: str | Path, image: str, materials: list[str], size: tuple[int, int], key: str = "masks"
 ) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Read the union of the annotations of each material in one photo.
+    """Read one mask for each material in one photo, the union of its annotations.
+
+    InputError is raised if an annotation is invalid, or if the image has another size.
 
     Args:
         path: COCO file.
@@ -170,9 +172,6 @@ def read_coco(
         materials: Materials of the dataset.
         size: Height and width of the photo.
         key: Key to name in errors.
-
-    Raises:
-        InputError: If an annotation is invalid, or if the image has another size.
     """
     content = read_bytes(path, "COCO", key, MOST_BYTES)
     with reading("COCO", path, key, "it needs images, annotations and categories"):
@@ -201,8 +200,7 @@ def read_coco(
             runs, longer = _shapes(segmentation, size, path, place)
             shapes += [(place, counts) for counts in runs]
             length += longer
-            if length > LONGEST_TOGETHER * sum(size):
-                most = LONGEST_TOGETHER * sum(size)
+            if length > (most := LONGEST_TOGETHER * sum(size)):
                 fault = f"all outlines together are {length:.3g} pixels long; at most {most:,} are read"
                 raise InputError(fault, file=path, key=place, cure=SIMPLER)
         masks[name] = _union(shapes, size, path)

@@ -35,12 +35,8 @@ log = logging.getLogger("factorlib.dataset")
 def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[str, ExternalCamera]]:
     """Read the cameras of a dataset's photos from its external source, the key `cameras` of dataset.yaml.
 
-    The returned dataset has world_from_camera of the source if `cameras` asks for it.  The cameras are by photo.  A
-    warning names photos that the source lacks.
-
-    Args:
-        spec: content of dataset.yaml
-        file: its path, for errors
+    `file` is the path of dataset.yaml.  The cameras are returned by photo, and the dataset with world_from_camera of
+    the source if `cameras` asks for it.  A warning names photos that the source lacks.
 
     Raises:
         InputError: The source cannot be read, a photo matches several of its images, or a camera is not a pinhole.
