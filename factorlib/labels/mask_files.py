@@ -48,7 +48,7 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
         Values.
 
     Raises:
-        InputError: If the file is no such PNG, or has another size.
+        InputError: If the file is not such a PNG, or has another size.
     """
     check_plain(path, "a PNG", key)
     with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:

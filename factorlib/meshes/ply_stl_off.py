@@ -291,7 +291,7 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
 
 
 def _loaded(load: Callable[[io.BytesIO], dict], content: bytes) -> dict:
-    """Call a reader of trimesh; ValueError for text that is no number, of which NumPy only warns."""
+    """Call a reader of trimesh; ValueError for text that is not a number, of which NumPy only warns."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("error", DeprecationWarning)
         try:

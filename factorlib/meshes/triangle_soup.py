@@ -210,7 +210,7 @@ def parse_numbers(text: str | bytes) -> Float[np.ndarray, " n"]:
     [1.0, 2.5, -300.0]
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy only warns of text that is no number
+        warnings.simplefilter("error")  # NumPy only warns of text that is not a number
         try:
             return np.fromstring(text, dtype=float, sep=" ") if text.strip() else np.empty(0)
         except DeprecationWarning:

@@ -52,7 +52,7 @@ def figure(recipe: Path) -> str:
     """Write the picture of a recipe; return its HTML.
 
     The caption is the recipe's first line, a comment, and what the picture's parts are.
-    Raises InputError if the first line is no comment.
+    Raises InputError if the first line is not a comment.
     """
     first = recipe.read_text("utf-8").partition("\n")[0]
     if not first.startswith("# "):

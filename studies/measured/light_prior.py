@@ -14,7 +14,7 @@ distribution", 1989), in which a map of much contrast has little weight w:
     (3)
 
 over t = log of variance, decay, nugget, level and ν. X holds the profile's polynomials, and for y_0 a one: its mean is
-the maps' mean exposure, which is no property of light. For the same reason the level of y_0 is not fitted but wide,
+the maps' mean exposure, which is not a property of light. For the same reason the level of y_0 is not fitted but wide,
 EXPOSURE_VARIANCE.
 """
 
