@@ -78,7 +78,7 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
-    """Open a photo of a format that OpenImageIO reads; InputError if it is not an image, or has neither grey nor RGB."""
+    """Open a photo of a format that OpenImageIO reads; InputError if it is not an image of grey or RGB."""
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
