@@ -67,7 +67,7 @@ def switched_on(key: str, option: bool) -> bool:
 
 
 def confirm(force: bool) -> bool:
-    """Return True to delete what was listed; a terminal is asked unless --force or FORCE=1 is given."""
+    """Return True if the listed files may be deleted; on a terminal the user is asked, unless FORCE=1 or --force."""
     asks = not switched_on("FORCE", force) and sys.stdin.isatty()
     return not asks or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 

@@ -271,7 +271,7 @@ def _masks_by_photo(
 
 
 def _labels_in(path: Path, photo: str) -> set[int]:
-    """Return the values of the pixels of a mask.  Raises InputError for a file that is no PNG or too large."""
+    """Return the values of the pixels of a mask.  Raises InputError for a file that is not a PNG or too large."""
     with reading("a PNG", path, photo, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as png:
         size = png.size
     check_pixels(size, MOST_MEGAPIXELS, path, photo)

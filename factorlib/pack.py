@@ -50,7 +50,7 @@ def write_pack(home: Path, out: Path, replace: bool = False) -> int:
         "the folder that it would be in does not exist": not out.absolute().parent.is_dir(),
     }
     if fault := next((fault for fault, applies in faults.items() if applies), None):
-        raise InputError(fault, file=out, key="OUT", cure="write OUT=<name>.zip")
+        raise InputError(fault, file=out, key="OUT", cure="write OUT=<name>.zip, in an existing folder")
     if out.exists() and not replace:
         raise InputError(
             "the file exists already", file=out, key="OUT", cure="name another file, or add FORCE=1 to replace it"

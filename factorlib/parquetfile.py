@@ -45,22 +45,23 @@ def read_columns(
     with reading(kind, path, cure=cure, also=(pa.ArrowException,)), pq.ParquetFile(path) as file:
         schema = file.schema_arrow
         if file.metadata.num_rows > most_rows:
-            raise ValueError(f"{file.metadata.num_rows:,} rows, more than {most_rows:,}")
+            raise ValueError(f"it has {file.metadata.num_rows:,} rows; at most {most_rows:,} are read")
         names = [*needed, *(name for name in optional if name in schema.names)]
         for name in names:
             if schema.names.count(name) != 1:
-                raise ValueError(f"it has {schema.names.count(name)} columns {name!r}")
+                raise ValueError(f"it has {schema.names.count(name)} columns {name!r}, and needs one")
             if not _is_readable(column_type := schema.field(name).type):
-                raise ValueError(f"column {name!r} is of type {column_type}")
+                expected = f"numbers, vectors of three, text, or up to {MOST_BYTES} bytes a row are read"
+                raise ValueError(f"column {name!r} is of type {column_type}; {expected}")
         table = file.read(columns=names)
         columns = {name: table[name].combine_chunks() for name in names}
         for name, column in columns.items():
             if column.null_count or (pa.types.is_fixed_size_list(column.type) and column.flatten().null_count):
-                raise ValueError(f"column {name!r} has empty places")
+                raise ValueError(f"column {name!r} has missing values")
             column.validate(full=True)
         about = json.loads((schema.metadata or {})[b"factorlib"])
         if not isinstance(about, dict):
-            raise ValueError("its metadata `factorlib` is no table")
+            raise ValueError("its metadata `factorlib` is not a JSON object")
     return columns, about
 
 

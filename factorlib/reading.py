@@ -185,7 +185,7 @@ def path_inside(folder: str | os.PathLike, path: str) -> Path:
             os.stat(target)
     except (OSError, RuntimeError, ValueError) as error:
         words = one_line(getattr(error, "strerror", None) or str(error))
-        raise ValueError(f"is no path that can be followed ({words})") from error
+        raise ValueError(f"is not a path that can be followed ({words})") from error
     if not path or Path(path).is_absolute() or not resolved.is_relative_to(Path(folder).resolve()):
         raise ValueError("leads outside the dataset")
     return target

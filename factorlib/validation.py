@@ -55,9 +55,9 @@ class Validation:
         return _faults(new)
 
     def recipe_faults(self, files: dict[str, Path]) -> list[InputError]:
-        """Return the faults of the lights and meshes that a recipe names; tables are checked with the recipe.
+        """Return the faults of the light and mesh files that a recipe names.
 
-        `files` are the paths by the names that the recipe uses.
+        `files` are the paths by the names in the recipe.  Tables of materials are checked when the recipe is read.
         """
         lights = [partial(read_light_map, path) for path in files.values() if is_light_file(path.name)]
         return _faults([*lights, *(partial(read_parts, p) for p in files.values() if p.suffix.lower() in MESHES)])
@@ -120,7 +120,7 @@ class Validation:
         radius = np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1)
         if np.ptp(radius) > NOT_ROUND * radius.max():
             raise InputError(
-                f"its vertices are {radius.min():.3g} to {radius.max():.3g} from its middle: it is no ball",
+                f"its vertices are {radius.min():.3g} to {radius.max():.3g} from its middle: it is not a ball",
                 file=self.file(file),
                 key=key,
                 cure="name a ball, or use `primitive: ball`",

@@ -119,7 +119,7 @@ def estimate_shape(
         entry: Mesh in dataset.yaml.
         outlines: Outlines of its objects in all photos.
         params: Parameters of the stage.
-        report: Receiver of the share that is done.
+        report: Called with the completed share, from 0 to 1.
 
     Raises:
         InputError: If no photo shows the mesh.

@@ -213,7 +213,7 @@ def _run_solver(
         problem: Observations and model.
         earlier: Earlier solution to start from, or None.
         inputs: Inputs of the stage.
-        progress: Receiver of progress.
+        progress: Called with the completed work, its total and the current activity.
     """
     names = inputs.facts["dataset.materials"]
     if params.solver == "paper":

@@ -183,7 +183,7 @@ def _estimate_surface(
         observations: Observations, by photo.
         attached: Nodes under the observations, by photo.
         surfaces: Subdivided meshes.
-        progress: Receiver of progress.
+        progress: Called with the completed work, its total and the current activity.
     """
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     worlds = {

@@ -29,7 +29,7 @@ def study_command(
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
-    """Run studies, as far as anything must run, with FORCE=1 all of it; SET="executor=tcp://…" says where."""
+    """Run the steps of studies that are not current, or all with FORCE=1; SET="executor=tcp://…" names the executor."""
     if gc:
         raise typer.Exit(collect(lambda: confirm(False)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])

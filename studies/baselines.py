@@ -27,13 +27,13 @@ ROWS = 32  # of the maps of even lights
 
 
 class MethodPrediction(msgspec.Struct, frozen=True):
-    """A method's answer.
+    """Answer of a method of the comparison.
 
     Attributes:
         materials: Reflectances that it states, by name, in the truth's gauge.
         lights: Maps that it states, by number, in that gauge.
         render: Radiance of a material in a light as a camera sees it: a photographed material by its name, or a new
-            one; a photo's light by its number, or a new one; at most one of them is new.  None where the method has no
+            one; a photo's light by its number, or a new one; at most one of them is new.  None if the method has no
             answer.
     """
 
@@ -53,7 +53,7 @@ def predict_by_rendering(materials: dict[str, Reflectance], lights: dict[int, Ma
 
 
 def predict_grey(photos: Photos, truths: Materials) -> MethodPrediction:
-    """Predict by the photos' mean colours."""
+    """Predict every picture by the mean colours of the photos."""
     ball = Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
     lights = {}
     for li in photos.lights:
@@ -70,7 +70,7 @@ class Texture:
         self._least = photo.normals[:, 2].min()
 
     def render(self, view: SphereView, values: Radiance) -> Radiance:
-        """Return the values of the photo's points at those of a view, extrapolated to points outside the photo."""
+        """Return the photo's values at the points that a view sees; points outside the photo are extrapolated."""
         visible = view.normals[:, 2] >= self._least
         colours = np.zeros((len(view.normals), 3))
         for points, count in ((visible, BETWEEN), (~visible, NEAREST)):

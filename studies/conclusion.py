@@ -56,7 +56,7 @@ def label(measure: str) -> str:
 
 
 def head(measure: str) -> str:
-    """Return the name of a measure and its unit, of tables and axes.
+    """Return the heading of a measure in tables and axes: its name and unit.
 
     >>> head("seconds"), head("roughness")
     ('processor time of a solve (s)', 'error of roughness')
@@ -106,10 +106,10 @@ def spread(values: Sequence[float], doubt: float = DOUBT) -> Spread:
 
 
 def difference(first: Mapping[int, float], second: Mapping[int, float], comparisons: int = 1) -> tuple[Spread, str]:
-    """Return the first setting minus the second over the seeds that both have, and what it shows of the first.
+    """Return the mean difference, first setting minus second, over their common seeds, and the verdict on it.
 
-    The latter is `lower`, `higher`, `not shown` or `too few seeds`.
-    comparisons: how many the study makes.  Raises ValueError where no seed has both.
+    The verdict on the first setting is `lower`, `higher`, `not shown` or `too few seeds`.
+    comparisons: how many the study makes.  Raises ValueError if no seed has both.
 
     >>> better = {seed: 0.1 + 0.001 * seed for seed in range(5)}
     >>> difference(better, {seed: 0.2 for seed in range(5)})[1]
@@ -286,7 +286,7 @@ def paragraph(table: Conclusion) -> str:
 
 
 def numbers(table: Conclusion, most: int) -> str:
-    """Return a Markdown table of the first measures of a study, at most so many."""
+    """Return a Markdown table of the first `most` measures of a study."""
     measures = table.measures[:most]
     rows = [[row.label, *(str(row.cells.get(m, "–")) for m in measures)] for row in table.rows]
     return markdown_table([table.varied, *map(head, measures)], rows)

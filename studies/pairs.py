@@ -118,7 +118,7 @@ class TrueSet(SolvedSet):
 
 
 def write_files(folder: Path) -> dict[str, Path]:
-    """Write the recipes' table of GIVEN, and the meshes that no set has; return them as files of `Inputs`."""
+    """Write the table of materials GIVEN and the meshes that no set has; return their paths as files of `Inputs`."""
     files = {name: folder / name for name in (TABLE, *MESHES) if "." in name}
     write_json(files[TABLE], {"materials": GIVEN})
     for body, path in ((SHAPES[path.stem](), path) for path in files.values() if path.stem in SHAPES):
@@ -132,7 +132,7 @@ def sample_recipes(
     """Draw photos and recipes of pairs, by a seed alone.
 
     Photos, meshes and materials are about equally often, places, sizes and turns at random.  A place where the recipe
-    would refuse or move the object in either is drawn anew; InputError where that happens `TRIALS` times.
+    would refuse or move the object in either is drawn anew; InputError if that happens `TRIALS` times.
     """
     rng = np.random.default_rng(seed)
     photos = list(recovered.photos)

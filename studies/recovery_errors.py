@@ -25,18 +25,18 @@ Materials = Mapping[str, Reflectance]
 
 
 def read_recovered_maps(solve: Path, numbers: Iterable[int]) -> dict[int, Map]:
-    """Return the recovered lights of these numbers, in the solve's own gauge; solve: the folder that it wrote."""
+    """Return the recovered lights by number, in the solve's own gauge; `solve` is the folder of its result."""
     lobes = read_lobes(solve / "lobes.parquet")
     return {li: lat_long_of_lobes(lobes[light_name(li)], ROWS, 2 * ROWS) for li in numbers}
 
 
 def gauge_factor(materials: Materials, truths: Materials) -> Float[np.ndarray, "3"]:
-    """Return the factor that takes the materials nearest to the true ones of their names."""
+    """Return the factor that brings materials nearest to the true materials of the same names."""
     return np.array(common_factor(list(materials.values()), [truths[name] for name in materials]))
 
 
 def scale_reflectance(material: Reflectance, factor: Float[np.ndarray, "3"]) -> Reflectance:
-    """Return a material that reflects so many times as much."""
+    """Return a material with k_d and k_s times a factor."""
     diffuse, specular = (tuple((np.array(k) * factor).tolist()) for k in (material.diffuse, material.specular))
     return Reflectance(diffuse, specular, material.roughness)
 

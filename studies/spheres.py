@@ -63,7 +63,7 @@ def materials_of(seed: int, names: Sequence[str] = SEVEN[:5]) -> dict[str, Refle
 def light_map(seed: int, light: int, rows: int, spp: int) -> Map:
     """Return light number `light` of a world, lat-long in the camera's y-up frame, mean radiance 1.
 
-    It is the same however many others there are.
+    It does not depend on the number of other lights.
     """
     rng = np.random.default_rng([12, seed, light])
     world_from_camera = look_rotation(rng.uniform(-14, -6), rng.uniform(0, 360))
@@ -83,7 +83,7 @@ def read_maps(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Map]:
 def observe_spheres(
     case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, OctahedralLight]
 ) -> dict[str, Observations]:
-    """Return one photo a light, by name, in the form in which the stage `urm` hands them to `solve`."""
+    """Return the observations of one photo for each light, by name, in the form that the stage `urm` writes."""
     return {light_name(li): _photo(case, li, list(materials.values()), lights[li]) for li in case.lights}
 
 
@@ -114,14 +114,14 @@ def tilt_normals(normals: Normals, degrees: float, rng: np.random.Generator) -> 
 def mislabel_pixels(
     n: int, label: int, labels: Sequence[int], share: float, rng: np.random.Generator
 ) -> Int[np.ndarray, " n"]:
-    """Return the label of each pixel: for `share` of them another one of `labels`, where there is any."""
+    """Return the label of each pixel, replaced for a `share` of them by another of `labels`, if there is any."""
     others = [other for other in labels if other != label]
     wrong = rng.random(n) < share
     return np.where(wrong, rng.choice(others, n), label) if others else np.full(n, label)
 
 
 def facet_normals(normals: Normals, facets: int | None) -> Normals:
-    """Return normals of a convex object that shows so many flat faces (`polyhedron_normals`).
+    """Return normals of a convex object with `facets` visible flat faces (`polyhedron_normals`).
 
     Each pixel has the normal of the face that is nearest to the sphere's, but for `CURVED` of the way.
     """
@@ -205,7 +205,7 @@ class Photos(msgspec.Struct, frozen=True):
 def photograph(
     case: Comparison, materials: Mapping[str, Reflectance], lights: Maps
 ) -> tuple[Photos, dict[str, Observations]]:
-    """Return the photos of a case, and the same as the stage `urm` hands them to `solve`."""
+    """Return the photos of a case, and their observations in the form that the stage `urm` writes."""
     tables = observe_spheres(case, materials, {li: octahedral_light(lights[li]) for li in case.lights})
     radiance = {
         (name, li): table.radiance[table.material == table.materials.index(name)]

@@ -110,7 +110,7 @@ class Score(msgspec.Struct, frozen=True):
     nulls: dict[str, float] = {}
 
     def __or__(self, other: "Score") -> "Score":
-        """Return the measures of both."""
+        """Return the measures of both scores together."""
         return Score(self.values | other.values, self.nulls | other.nulls)
 
 
@@ -129,7 +129,7 @@ def case_name(setting: str, seed: int) -> str:
 
 
 def full_matrix(materials: int, lights: int) -> list[Entry]:
-    """Return every material in every light.
+    """Return the entries (material, light) of the full matrix.
 
     >>> full_matrix(1, 2)
     [(0, 0), (0, 1)]

@@ -55,7 +55,9 @@ def opened(file: Path, **context) -> Iterator[tuple[Any, list[str]]]:
     """The page and a list that gathers what it complains of; context: what Playwright's `new_context` takes."""
     here = started().new_context(**context)
     page, complaints = here.new_page(), []
-    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    page.on(
+        "console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None
+    )
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("request", lambda r: complaints.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
     page.set_default_timeout(120000)  # software draws slowly on a busy machine

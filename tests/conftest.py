@@ -15,9 +15,9 @@ settings.load_profile("untimed")  # a busy machine fails no test
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory):
     """The toy, everything made; nobody changes it."""
-    made = toy.make_project(tmp_path_factory.mktemp("toy") / "root")
-    assert toy.make(made) == 0
-    return made
+    project = toy.make_project(tmp_path_factory.mktemp("toy") / "root")
+    assert toy.make(project) == 0
+    return project
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ SCIENCE = {"numpy", "torch", "scipy", "OpenImageIO", "PIL"}
 ])  # fmt: skip
 def test_what_must_start_quickly_loads_nothing_heavy(code, heavy):
     code = f"import sys; {code}; sys.exit(', '.join({heavy!r} & set(sys.modules)) or 0)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
 
 
 def test_every_stage_of_the_pipeline_has_its_module_and_the_runner_finds_what_it_imports():

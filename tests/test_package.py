@@ -36,15 +36,15 @@ EXTRAS = {  # of modules that import what an extra alone installs
 
 @pytest.mark.parametrize("folder", ["factorlib", "stages"])
 def test_every_import_is_a_dependency_that_is_declared(folder):
-    of = {module: {canonicalize_name(name) for name in found} for module, found in packages_distributions().items()}
+    of = {module: {canonicalize_name(name) for name in result} for module, result in packages_distributions().items()}
     for file in sorted((ROOT / folder).rglob("*.py")):
         extra = PROJECT["optional-dependencies"][EXTRAS[file]] if file in EXTRAS else ["packaging"]
         declared = {canonicalize_name(Requirement(text).name) for text in PROJECT["dependencies"] + extra}
-        found = set()
+        result = set()
         for node in ast.walk(ast.parse(file.read_text())):
-            found |= {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
-            found |= {node.module} if isinstance(node, ast.ImportFrom) and node.module and not node.level else set()
-        modules = {name.split(".")[0] for name in found} - OURS - sys.stdlib_module_names
+            result |= {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
+            result |= {node.module} if isinstance(node, ast.ImportFrom) and node.module and not node.level else set()
+        modules = {name.split(".")[0] for name in result} - OURS - sys.stdlib_module_names
         missing = {each for each in modules if not ({canonicalize_name(each)} | of.get(each, set())) & declared}
         assert not missing, file
 
@@ -85,26 +85,26 @@ def run(site, *words, cwd):
 
 
 def test_an_installed_wheel_has_its_command_and_its_operator(installed, tmp_path):
-    done = run(installed, str(installed / "bin" / "factorlib"), "--help", cwd=tmp_path)
-    assert done.returncode == 0 and "usage: factorlib" in done.stdout and "validate" in done.stdout
+    process = run(installed, str(installed / "bin" / "factorlib"), "--help", cwd=tmp_path)
+    assert process.returncode == 0 and "usage: factorlib" in process.stdout and "validate" in process.stdout
     code = "import factorlib; from factorlib.reflection import reflection_operator; print(factorlib.__file__, reflection_operator('network'))"
-    done = run(installed, "-c", code, cwd=tmp_path)
-    assert done.returncode == 0 and done.stdout.startswith(str(installed)), done.stderr
+    process = run(installed, "-c", code, cwd=tmp_path)
+    assert process.returncode == 0 and process.stdout.startswith(str(installed)), process.stderr
 
 
 def test_an_installed_command_away_from_a_checkout_has_the_same_pipeline_and_the_same_keys(installed, tmp_path):
     """What a result is known by does not depend on where the stages lie: the records of a plan are those of the checkout."""
     shutil.copytree(ROOT / "data" / "synthetic", tmp_path / "data" / "synthetic")
     command = str(installed / "bin" / "factorlib")
-    done = run(installed, command, "validate", "-d", "synthetic", cwd=tmp_path)
-    assert done.returncode == 0 and "are good" in done.stdout, done.stderr
-    done = run(installed, command, "plan", "-d", "synthetic", "--recipe", "insert", cwd=tmp_path)
-    assert done.returncode == 0 and "recipes" in done.stdout, done.stderr
+    process = run(installed, command, "validate", "-d", "synthetic", cwd=tmp_path)
+    assert process.returncode == 0 and "are good" in process.stdout, process.stderr
+    process = run(installed, command, "plan", "-d", "synthetic", "--recipe", "insert", cwd=tmp_path)
+    assert process.returncode == 0 and "recipes" in process.stdout, process.stderr
     assert (tmp_path / "build").is_dir() and not (installed / "build").exists()
     here, there = (run(site, "-c", RECORDS, cwd=tmp_path) for site in (installed, ROOT))
     assert here.stdout == there.stdout != "", here.stderr + there.stderr
 
 
 def test_an_installed_command_in_a_checkout_takes_its_pipeline(installed):
-    done = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=ROOT / "data")
-    assert done.returncode == 0 and "solve" in done.stdout
+    process = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=ROOT / "data")
+    assert process.returncode == 0 and "solve" in process.stdout

@@ -78,14 +78,14 @@ def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
 def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(folder.parent.parent)
     assert factorlib.load_result("set").photos == factorlib.load_result("build/set").photos
-    for name, found, cure in [
+    for name, result, cure in [
         ("build/sett", "there is no result here", "did you mean 'build/set'"),
         ("data/set", "there is no result here", "build/set"),
         ("build/set/export", "this is a part of a result", 'load_result("build/set")'),
         ("build/set/export/materials.json", "this is a part of a result", 'load_result("build/set")'),
         ("build/set/exprt", "there is no result here", "build/set"),
     ]:
-        assert cure in str(refusal(found, factorlib.load_result, name))
+        assert cure in str(refusal(result, factorlib.load_result, name))
     monkeypatch.chdir(folder / "masks")
     refusal(r'load_result\("\.\."\)|load_result\("\.\./\.\./\.\./build/set"\)', factorlib.load_result, "../export")
     monkeypatch.chdir(tmp_path)
@@ -151,8 +151,8 @@ def test_environments_are_the_exported_ones_turned_and_written(result, folder, t
     assert np.array_equal(light.lat_long, read_rgb_exr(folder / "export" / "illumination" / "room.exr"))
     light.to_exr(tmp_path / "room.exr")
     light.to_hdr(tmp_path / "room.hdr")
-    found, brightest = read_light_map(tmp_path / "room.hdr"), light.lat_long.max(axis=-1, keepdims=True)
-    assert (np.abs(found - light.lat_long) <= brightest / 128).all()
+    actual, brightest = read_light_map(tmp_path / "room.hdr"), light.lat_long.max(axis=-1, keepdims=True)
+    assert (np.abs(actual - light.lat_long) <= brightest / 128).all()
     assert np.array_equal(read_rgb_exr(tmp_path / "room.exr"), light.lat_long.astype(np.float32))
     spot = factorlib.result.Environment(np.zeros((16, 32, 3)))
     spot.lat_long[8, 16] = 1  # toward the viewer
@@ -228,9 +228,9 @@ def test_the_notebook_runs_in_its_own_folder_and_shows_its_tables_and_pictures(f
     shown = [html for html in shown if html]
     assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 8]
     assert "0.350 ± 0.100" in shown[0] and "front, side" in shown[0]
-    said = capsys.readouterr().out
-    assert "roughness 0.350 ± 0.100" in said
-    assert all(words in said for words in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'"))
+    output = capsys.readouterr().out
+    assert "roughness 0.350 ± 0.100" in output
+    assert all(words in output for words in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'"))
     assert {path.name for path in docs.iterdir()} == {"pictures"}
     names = {"chair.exr", "chair.png", "side_turned.exr", "side_turned.hdr", "front.exr", "front.json", "front.png"}
     assert {path.name for path in (docs / "pictures").iterdir()} == names

@@ -18,9 +18,10 @@ def lacking(monkeypatch):
 def test_a_library_that_is_missing_is_one_message_with_the_command_and_root_installs_it(lacking, capsys):
     with pytest.raises(SystemExit, match=r"do not load"):
         setup.check_system()
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert (
-        "libnone.so.9, libfast.so.1" in said and "apt-get update && sudo apt-get install -y libnone9 libfast1" in said
+        "libnone.so.9, libfast.so.1" in output
+        and "apt-get update && sudo apt-get install -y libnone9 libfast1" in output
     )
     calls, there = [], {"libnone.so.9"}
     lacking.setattr(setup, "loads", lambda name: name in there)

@@ -26,8 +26,8 @@ def example():
 @pytest.fixture
 def cluster(example, tmp_path):
     options = {"dashboard_address": ":0", "host": "127.0.0.1"}
-    with example["slurm_cluster"](scheduler_options=options, log_directory=str(tmp_path)) as found:
-        yield found
+    with example["slurm_cluster"](scheduler_options=options, log_directory=str(tmp_path)) as result:
+        yield result
 
 
 def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(cluster, tmp_path):

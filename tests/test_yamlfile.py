@@ -34,8 +34,8 @@ class Outer(msgspec.Struct, forbid_unknown_fields=True):
     ],
 )  # fmt: skip
 def test_scalars_are_those_of_yaml_1_2(text, value):
-    found = parse_yaml(text)
-    assert found == value and type(found) is type(value)
+    result = parse_yaml(text)
+    assert result == value and type(result) is type(value)
 
 
 @given(st.floats(allow_nan=False))

@@ -72,7 +72,7 @@ class ObjectToAlign(msgspec.Struct, frozen=True):
 class Focal(msgspec.Struct, frozen=True):
     """Focal length of the photo at one point of the alignment, as given or as estimated so far.
 
-    camera        the photo's camera with it
+    camera        the photo's camera at this focal length
     prior_sigma   standard deviation of its prior for the next object, log; 0 once it is settled
     source        dataset | colmap | transforms | bop | exif | estimated
     stderr        standard error of its logarithm, once it is estimated
@@ -115,7 +115,7 @@ def align_photo(
         known: Prior knowledge of the focal length.
         photo: Name of the photo.
         search: Effort of the search.
-        report: Function called now and then with the number of searches that are done, fractions included.
+        report: Called now and then with the number of completed searches, fractions included.
 
     Returns:
         The camera and the poses. The focal length, where `known` does not give it, is estimated with the object that
@@ -175,7 +175,7 @@ def _estimate_object(
         view: Its mask and the photo's camera.
         photo: Name of the photo.
         search: Effort of the search.
-        report: Function of the share that is done.
+        report: Called with the completed share, from 0 to 1.
 
     Returns:
         The pose.

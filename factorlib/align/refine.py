@@ -83,7 +83,7 @@ class PoseState(msgspec.Struct, frozen=True):
         return PoseState(rotation_of_vector(step[:3]) @ self.rotation, a, b, log_depth, float(self.log_focal + zoom))
 
     def jacobian(self, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 7"]:
-        """Return the derivative of image points (photo pixels) by the step of `moved`.
+        """Return the derivative of image points (photo pixels) by the step of `apply_step`, [n, 2, 7].
 
         `arms` are the points' offsets from the centre, in camera axes.
         """
@@ -192,7 +192,7 @@ def normal_equations(
             `PoseState.jacobian`.
 
     Returns:
-        Information and gradient; the first seven unknowns are those of `PoseState.moved`.
+        Information and gradient; the first seven unknowns are those of `PoseState.apply_step`.
     """
     target = rendering.target
     state = rendering.state

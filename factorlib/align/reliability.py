@@ -212,7 +212,7 @@ def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
 
 
 def normal_spread(maps: Maps) -> Float[np.ndarray, "h w"]:
-    """Return the spread of the normals in 3 × 3 pixels that show a mesh, radians: turn of (1)."""
+    """Return the spread of the normals within 3 × 3 pixels, radians, the `turn` of (1); 0 at pixels without a mesh."""
     mesh = (maps.label > 0).astype(float)
     share = np.maximum(uniform_filter(mesh, 3, mode="constant"), 1e-12)
     sums = [uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)]

@@ -80,7 +80,7 @@ def estimate_pose(
         caster: The mesh.
         view: The mask, with at least one pixel of the object, and the camera.
         search: Effort of the search.
-        report: Function of the share of the search that is done, called after the first guesses and after each round.
+        report: Called with the completed share of the search, after the first guesses and after each round.
 
     Returns:
         The pose with its score and runner-up.

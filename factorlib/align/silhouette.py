@@ -45,7 +45,7 @@ class Silhouette(msgspec.Struct, frozen=True):
 
 
 def silhouette_of_photo(channels: Channels) -> Silhouette:
-    """Return the silhouette of the whole photo, from the channels that the stage `masks` wrote."""
+    """Return the silhouette of all objects of a photo together, from the channels that the stage `masks` wrote."""
     label = np.round(channels["label"]).astype(np.int16)
     if "left_out" in channels:
         label[channels["left_out"] > 0.5] = UNKNOWN
@@ -122,7 +122,7 @@ class ObjectView(msgspec.Struct, frozen=True):
 
     @property
     def free(self) -> int:
-        """Number of free unknowns of `PoseState.moved`: 7, or 6 if the focal length is known."""
+        """Number of free unknowns of `PoseState.apply_step`: 7, or 6 if the focal length is known."""
         return 7 if self.focal_sigma > 0 else 6
 
     def mirror(self) -> "ObjectView":

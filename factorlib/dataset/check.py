@@ -326,7 +326,7 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             material = min(instance_materials(ball, spec))
             mesh = spec.meshes[ball.mesh]
             if len(instance_materials(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
-                refuse(key, f"mesh {ball.mesh!r} is no ball of one material", "give a mesh file, or `primitive: ball`")
+                refuse(key, f"mesh {ball.mesh!r} is not a ball of one material", "give a file, or `primitive: ball`")
             if any(material in instance_materials(obj, spec) for obj in photo.objects if obj is not ball):
                 cure = "give the ball a material of its own"
                 refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)

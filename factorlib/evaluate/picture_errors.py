@@ -180,7 +180,7 @@ class ComparedPhoto(msgspec.Struct, frozen=True):
         pixels: mask of the pixels that count
         white: radiance that the tone map shows as white
         counts: numbers of pixels by kind
-        clipped_satisfied: see the module
+        clipped_satisfied: fraction of the clipped pixels whose re-synthesis reaches the clipped value; None without any
     """
 
     photo: Picture

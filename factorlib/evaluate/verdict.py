@@ -77,9 +77,9 @@ class VerdictInputs(msgspec.Struct, frozen=True):
 
     Attributes:
         materials: m² of each material that a photo shows (`ball_changes`)
-        unexplained: u of the set
+        unexplained: u, share of the shading of all photos that is not explained
         photos: unexplained share and clipped share of each photo
-        contours: d of each object with a compared outline, by photo and object
+        contours: d, contour error of each object with a compared outline, by photo and object
         deviation: deviation of the residuals in units of their noise, which scales the standard errors of materials
     """
 

@@ -225,9 +225,9 @@ def differences(material: Reflectance) -> dict[str, dict[str, float]]:
 
 
 def ball_radiance(material: Reflectance, model: Model) -> Float[np.ndarray, "n 3"]:
-    """Return the radiance of the ball's pixels in all lights: in a sky of radiance 1, and under lamps of irradiance π.
+    """Return the radiance of a ball's pixels in a sky of radiance 1, then under each of `LAMPS`, one after the other.
 
-    Under a lamp it is f · n·i · π.
+    Every lamp has irradiance π, so the radiance under it is f · n·i · π.
     """
     normals = ball_normals(PIXELS)[0]
     normals = normals[normals[:, 2] >= LEAST_COSINE]

@@ -103,7 +103,7 @@ def _write(set_: ModuleType, parameters: msgspec.Struct, out: Path, seed: int, l
         maps = maps_in([lights]) if lights else []
         if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
             raise InputError(
-                "this folder holds something else than a data set",
+                "this folder is neither empty nor a data set",
                 file=out,
                 cure="name an empty folder, or a data set to replace",
             )

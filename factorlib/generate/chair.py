@@ -154,7 +154,7 @@ def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Fl
 
 
 def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Triangulate the band between two closed rings of as many points."""
+    """Triangulate the band between two closed rings of vertex indices, of equal length n; return faces [2n, 3]."""
     a = first
     b = np.roll(first, -1)
     c = second

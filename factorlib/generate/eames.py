@@ -114,8 +114,8 @@ def generate(
         seed: Seed; 0 is the set in the repository.
         lat_longs: Light maps of the user, which replace the generated lights.
         parameters: Options of the set.
-        progress: Function of the number of photos that are done, of their total, and of the current photo's name.
-        shots: Photos.
+        progress: Called with the number of finished photos, their total, and the current photo's name.
+        shots: Shots to render, one for each photo.
     """
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)

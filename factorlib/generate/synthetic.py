@@ -131,7 +131,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Synthe
         seed: Seed; 0 is the set in the repository.
         lat_longs: Light maps of the user, which replace the generated lights.
         parameters: Options of the set.
-        progress: Function of the number of steps that are done, of their total, and of the current step.
+        progress: Called with the number of finished steps, their total, and the current step.
     """
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)

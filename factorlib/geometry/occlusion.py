@@ -108,7 +108,7 @@ class Occluders(Caster):
             shading_normal: Unit shading normals of the pixels.
             directions: Number of directions.
             most_points: Greatest number of points to cast from, approximately.
-            report: Function, called now and then, of the number of cast points that are done and of their total.
+            report: Called now and then with the number of finished points and their total.
 
         Returns:
             Visibility and codes; None if all directions are visible from all points.
@@ -141,7 +141,7 @@ class Occluders(Caster):
             points: Surface points.
             shading_normal: Unit shading normals of the points.
             directions: Unit directions, camera frame.
-            report: Function of the number of points that are done and of their total.
+            report: Called with the number of finished points and their total.
 
         Returns:
             Visibility and codes of the hiding surfaces.
@@ -168,7 +168,7 @@ class Occluders(Caster):
             points: Surface points.
             shading_normal: Unit shading normals of the points.
             directions: Unit directions, camera frame.
-            report: Function of the number of points that are done and of their total.
+            report: Called with the number of finished points and their total.
 
         Yields:
             Arrays [n]: number of the point; number of the direction; number of the face that is hit, −1 if unknown;

@@ -102,7 +102,7 @@ def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:
     """Read all channels of an EXR as float32, by name.
 
     Raises:
-        InputError: If the file is no EXR, or no plain file (a pipe would never end).
+        InputError: If the file is not an EXR, or not a plain file (a pipe would never end).
     """
     check_plain(path, "an image", most_bytes=None)
     source = oiio.ImageInput.open(str(path))

@@ -49,7 +49,7 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
         Radiance.
 
     Raises:
-        InputError: If the file is no map, is black, or has radiance that is not a number, infinite, or negative beyond
+        InputError: If the file is not a map, is black, or has radiance that is NaN, infinite, or negative beyond
             what resampling leaves.
     """
     check_plain(path, "a light", key, most_bytes=None)

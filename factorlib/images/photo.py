@@ -4,8 +4,8 @@ Orientation   as displayed: the EXIF orientation is applied.
 Encoding      8- and 16-bit files are sRGB-encoded, float and raw files linear, unless `encoding` is given; primaries
               are assumed to be Rec. 709.
 Channels      one channel is grey; alpha is dropped.
-Clipped       integer codes from CLIPPED of the range (254 of 255) on; for a raw file, saturated sensor pixels. A float
-              file has no top code; values that are not finite are invalid pixels.
+Clipped       integer codes from `scanlines.CLIPPED` of the range (254 of 255) on; for a raw file, saturated sensor
+              pixels. A float file has no top code; values that are not finite are invalid pixels.
 Size          a photo can be downsampled by a whole factor f while it is read, so that only some rows of it are in
               memory at a time: radiance by its linear mean; clipped if any part is; finite if any part is. Every pixel
               of the smaller picture is a box of f × f pixels. A whole factor is exact: each pixel belongs to one box,
@@ -133,7 +133,7 @@ def decode_photo(
         encoding: Encoding of its values; None takes what the format implies.
         factor: Factor of the downsampling.
         path: File to name in warnings.
-        look: Function of all linear values of the file, some rows at a time, before they are averaged.
+        look: Called with the linear values of the file, some rows at a time, before they are averaged.
     """
     encoding = encoding or opened.encoding
     height, width = (n // factor for n in (opened.height, opened.width))

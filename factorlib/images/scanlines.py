@@ -78,7 +78,7 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
-    """Open a photo of a format that OpenImageIO reads; InputError if it is no image, or has neither grey nor RGB."""
+    """Open a photo of a format that OpenImageIO reads; InputError if it is not an image of grey or RGB."""
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
@@ -171,7 +171,7 @@ def check_pixels(size: tuple[int, int], most_megapixels: float, path: str | Path
 def check_values(path: str | Path, most_megapixels: float = MOST_MEGAPIXELS, key: str | None = None) -> None:
     """Check that an image file has at most as many values as the largest photo has with CHANNELS channels.
 
-    A file that is no image, or of a kind that OpenImageIO does not read, passes: its reader rejects it.
+    A file that is not an image, or of a kind that OpenImageIO does not read, passes: its reader rejects it.
 
     Args:
         path: File.

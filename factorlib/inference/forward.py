@@ -82,7 +82,7 @@ class Linearised(NamedTuple):
 
 
 class Gradient(NamedTuple):
-    """Value, and half its gradient by the material unknowns of all m materials and by the unknowns of a light."""
+    """Loss of one light, and half its gradient by the unknowns of all m materials and by those of the light."""
 
     value: float
     by_materials: Float[np.ndarray, "m 7"]

@@ -56,7 +56,7 @@ class UnitLobes(msgspec.Struct, frozen=True):
 
 
 def fibonacci_cells(count: int) -> UnitLobes:
-    """Return `count` cells of one size, by (1)."""
+    """Return lobes of weight one for `count` cells of equal size, spread evenly over the sphere, by (1)."""
     return UnitLobes(fibonacci_sphere(count), np.full(count, count / (4 * np.pi * WIDTH**2)))
 
 

@@ -48,7 +48,7 @@ LARGEST_DAMPING = 1e3  # a descent ends beyond this μ
 TOLERANCE = 2e-4  # a descent ends if (1) falls by less than this share of its value
 MEMORY = 10  # pairs of L-BFGS
 LBFGS_STEPS = 12  # most steps of L-BFGS on one factorisation
-# L-BFGS ends if gᵀH⁻¹g, the predicted decrease, falls below DECREMENT or below SHARE of its first value.
+# L-BFGS ends if gᵀH⁻¹g, the predicted decrease, falls below DECREMENT or below DECREMENT_SHARE of its first value.
 DECREMENT = 0.05
 DECREMENT_SHARE = 0.02
 SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope

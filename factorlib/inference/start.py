@@ -42,7 +42,7 @@ BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
 # Start of every material.
 START_ROUGHNESS = 0.4
 SPECULAR_SHARE = 0.2
-# With at most FEW materials, a solve starts from each roughness of STARTS.
+# With at most FEW_MATERIALS materials, a solve starts from each roughness of START_ROUGHNESSES.
 FEW_MATERIALS = 2
 START_ROUGHNESSES = (0.15, 0.4, 0.8)
 LEAST_RADIANCE = 1e-6  # least radiance, as a share of a block's mean
@@ -133,7 +133,7 @@ def start_from_surface(initial: InitialFit) -> Start:
 
 
 def insert_known(point: Point, problem: JointProblem) -> Point:
-    """Return the point with known values inserted, and the rest of each component at their scale."""
+    """Return the point with known values inserted; the other unknowns of each component are scaled to match."""
     known = problem.known
     lights = list(point.lights)
     if known.is_empty:

@@ -83,7 +83,7 @@ class SurfaceEstimate(msgspec.Struct, frozen=True):
         painted: Decision on detail of reflectance, likewise.
         stiffness: Stiffness of the chosen detail.
         gains: Decrease of −2 log marginal likelihood of each held-out photo by the kept detail.
-        displacements: Displacements at the nodes of each moved mesh, in extents.
+        displacements: Displacements at the nodes of each moved mesh, in units of the mesh's extent.
         log_factors: Log factors at the nodes of each mesh; empty if they are not kept.
     """
 
@@ -333,7 +333,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
         return best
 
     def select_turns(self) -> tuple[StiffnessChoice, set[str]]:
-        """Return the likeliest turns, and the meshes that gain from their turns alone."""
+        """Choose the stiffness of turned normals; return it with the meshes whose turns improve held-out photos."""
         candidates = [Stiffness(a) for a in TURN_STIFFNESSES]
         turned = self.select_stiffness(candidates, self.plain, (CLEARLY_FOR, 0.0), self.trial.shared_nodes)
         movable = self.select_meshes(turned.details) if turned.scores.gain_over(self.plain) > 0 else set()
@@ -350,7 +350,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
         Args:
             stiffness: Stiffness of the detail.
             movable: Meshes whose normals may turn.
-            pieces: Report of progress.
+            pieces: Progress report, divided into sections.
             seed: Seed of the drawn observations.
         """
         trial = self.trial

@@ -132,7 +132,7 @@ class Surfaces(msgspec.Struct, frozen=True):
     def displacements(
         self, turn: Float[np.ndarray, "v 3"], attached: Sequence[SurfacePositions]
     ) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return the displacement of each mesh that best explains the turns of its nodes, in extents.
+        """Return the displacements that best explain the turns of nodes, by mesh, in units of the mesh's extent.
 
         Nodes count by the observations attached to them (`SubdividedMesh.displacement`).
         """
@@ -165,7 +165,7 @@ def attach_pixels(
     objects: Mapping[str, tuple[str, ObjectPose]],
     surfaces: Surfaces,
 ) -> SurfacePositions:
-    """Return the nodes under pixels (x, y), in the camera's frame.
+    """Return the positions on the surfaces that pixels (x, y) show, for normals in the camera's frame.
 
     Args:
         pixels: Integer pixel coordinates.
@@ -265,20 +265,20 @@ class LightTerms(msgspec.Struct, frozen=True, dict=True):
         return LightTerms(slopes, self.residual[remaining], self.by_light[:, ~dropped], hessian, gradient, p)
 
     def residual_change(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
-        """Return U times a change of the light."""
+        """Return U du, the linearised change of the residuals by a change du of the light's unknowns."""
         cells = unknowns[: 3 * self.cells].reshape(3, -1)
         shared = unknowns[3 * self.cells :]
         changes = [U @ np.append(u, shared).astype(np.float32) for U, u in zip(self.by_light, cells, strict=True)]
         return np.stack(changes, axis=1).reshape(-1).astype(float)
 
     def light_gradient(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " l"]:
-        """Return Uᵀ times a change of the residuals."""
+        """Return Uᵀ dr, the change of the light's gradient by a change dr of the residuals."""
         gradients = [U.T @ r.astype(np.float32) for U, r in zip(self.by_light, change.reshape(-1, 3).T, strict=True)]
         cells = [channel[: self.cells] for channel in gradients]
         return np.concatenate([*cells, np.sum([channel[self.cells :] for channel in gradients], axis=0)]).astype(float)
 
     def reduce_by_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " 3n"]:
-        """Return (1 − U H⁻¹ Uᵀ) times a change of the residuals."""
+        """Return (1 − U H⁻¹ Uᵀ) dr, the part of a change dr of the residuals that the light does not absorb."""
         return change - self.residual_change(cho_solve(self.factor, self.light_gradient(change)))
 
 

@@ -48,7 +48,7 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
         Values.
 
     Raises:
-        InputError: If the file is no such PNG, or has another size.
+        InputError: If the file is not such a PNG, or has another size.
     """
     check_plain(path, "a PNG", key)
     with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:
@@ -162,7 +162,9 @@ class Coco(msgspec.Struct, frozen=True):
 def read_coco(
     path: str | Path, image: str, materials: list[str], size: tuple[int, int], key: str = "masks"
 ) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Read the union of the annotations of each material in one photo.
+    """Read one mask for each material in one photo, the union of its annotations.
+
+    InputError is raised if an annotation is invalid, or if the image has another size.
 
     Args:
         path: COCO file.
@@ -170,9 +172,6 @@ def read_coco(
         materials: Materials of the dataset.
         size: Height and width of the photo.
         key: Key to name in errors.
-
-    Raises:
-        InputError: If an annotation is invalid, or if the image has another size.
     """
     content = read_bytes(path, "COCO", key, MOST_BYTES)
     with reading("COCO", path, key, "it needs images, annotations and categories"):
@@ -191,7 +190,7 @@ def read_coco(
             raise InputError(fault, file=path, key=place, cure="add the category, or correct category_id")
         if name not in materials:
             cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
-            raise InputError(f"category {name!r} is no material", file=path, key=place, cure=cure)
+            raise InputError(f"category {name!r} is not a material", file=path, key=place, cure=cure)
         segmentations.setdefault(name, []).append((f"{place}.segmentation", annotation.segmentation))
     masks = {}
     length = 0.0  # of all outlines
@@ -201,8 +200,9 @@ def read_coco(
             runs, longer = _shapes(segmentation, size, path, place)
             shapes += [(place, counts) for counts in runs]
             length += longer
-            if length > LONGEST_TOGETHER * sum(size):
-                raise InputError(f"all outlines together are {length:.3g} px long", file=path, key=place, cure=SIMPLER)
+            if length > (most := LONGEST_TOGETHER * sum(size)):
+                fault = f"all outlines together are {length:.3g} pixels long; at most {most:,} are read"
+                raise InputError(fault, file=path, key=place, cure=SIMPLER)
         masks[name] = _union(shapes, size, path)
     return masks
 
@@ -236,7 +236,7 @@ def run_lengths(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
     value = shift = 0
     for code in counts.encode("ascii") if isinstance(counts, str) else ():
         if not 48 <= code < 112 or shift >= 5 * MOST_DIGITS:
-            raise ValueError("it is no compressed RLE, or a run is longer than any picture")
+            raise ValueError("it is not a compressed RLE, or a run is longer than any picture")
         value |= (code - 48 & 31) << shift
         shift += 5
         if not code - 48 & 32:  # the last character of a run, whose highest bit is the sign
@@ -296,7 +296,7 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         corners = np.array(polygon)
         cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
         if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
-            fault = "is no polygon"
+            fault = "is not a polygon"
         elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
             fault = f"has corners outside the image of {_wh(shape)} pixels"
             cure = "clip it to the image; if it was drawn at another size, export it at the photo's own size"

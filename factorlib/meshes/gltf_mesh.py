@@ -34,7 +34,7 @@ def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
 
     Raises:
         InputError: If the file is malformed or too large.
-        ValueError: If its nodes are no tree; other exceptions of trimesh are possible too.
+        ValueError: If its nodes do not form a tree; other exceptions of trimesh are possible too.
     """
     from trimesh.exchange.gltf import load_glb, load_gltf
 
@@ -83,7 +83,7 @@ class _BufferFiles(dict[str, bytes]):
 
 
 def _parts(header: GltfHeader) -> list[Part]:
-    """Return the primitives of the scene's nodes, in the order of the nodes; ValueError if the nodes are no tree."""
+    """Return the primitives of the scene's nodes, in the order of the nodes; ValueError if they do not form a tree."""
     from trimesh.util import unique_name
 
     used: dict[str, None] = {}
@@ -123,7 +123,7 @@ def _world_from_nodes(header: GltfHeader) -> dict[int, Float[np.ndarray, "4 4"]]
         index, world_from_parent = waiting.pop()
         node = header.nodes[index]
         if index in places:
-            raise ValueError(f"its node {index} is below two others, or below itself")
+            raise ValueError(f"its node {index} has two parents, or is its own ancestor")
         if not any(node.rotation):
             raise ValueError("the rotation of a node is the quaternion 0 0 0 0")
         with np.errstate(all="ignore"):  # values that are not finite are refused with the vertices

@@ -45,7 +45,7 @@ class _Tables:
         for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words):
             corners.append((_index(vertex, vertices), _index(normal, normals) if normal else -1))
         if len(corners) < 3:
-            raise ValueError("a face has at least three corners")
+            raise ValueError("a face needs at least three corners")
         names = tuple(dict.fromkeys(name for kind in self.names.values() for name in kind if name))
         part = self.parts.setdefault(names, len(self.parts))
         for second, third in zip(corners[1:], corners[2:]):
@@ -99,5 +99,5 @@ def _index(word: str, count: int) -> int:
     if index == 0:
         raise ValueError("index 0: OBJ counts from 1")
     if abs(index) > MOST:
-        raise ValueError("an index beyond any vertex")
+        raise ValueError(f"index {index} is larger than {MOST:,}")
     return index - 1 if index > 0 else count + index

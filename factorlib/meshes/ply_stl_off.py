@@ -124,7 +124,7 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
                 case ["property", kind, name] if properties is not None and name not in properties:
                     properties[name] = TYPES[kind], None
                 case _:
-                    raise ValueError("not a line of PLY, or a second one of that name")
+                    raise ValueError("it is not a line of a PLY header, or repeats a name")
         except (ValueError, LookupError, TypeError) as error:
             raise InputError(
                 f"its header has the line {quoted(' '.join(line.split()))} ({quoted(str(error))[1:-1]})",
@@ -177,7 +177,7 @@ def _columns(content: bytes, offset: int, order: str, count: int, properties: Pr
                 fields.append((f"n{number}", counter, ()))
                 length = np.frombuffer(content, counter, 1, place)[0].item()
                 if length < 0 or length != int(length):
-                    raise ValueError(f"a list has the length {length}")
+                    raise ValueError(f"a list has the length {length}, which must be a whole number of at least 0")
                 place += counter.itemsize
             lengths.append(int(length) if counter else 1)
             fields.append((f"v{number}", kind, (lengths[-1],)))
@@ -291,10 +291,10 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
 
 
 def _loaded(load: Callable[[io.BytesIO], dict], content: bytes) -> dict:
-    """Call a reader of trimesh; ValueError for text that is no number, of which NumPy only warns."""
+    """Call a reader of trimesh; ValueError for text that is not a number, of which NumPy only warns."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("error", DeprecationWarning)
         try:
             return load(io.BytesIO(content))
         except DeprecationWarning:
-            raise ValueError("something in it is no number") from None
+            raise ValueError("a word in it is not a number") from None

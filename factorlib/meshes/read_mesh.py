@@ -228,7 +228,7 @@ def usable(soup: TriangleSoup, face_label: np.ndarray, crease_deg: float, file: 
 
 
 def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return welded vertices, the faces on them, and a mask of the faces that have an area and are no duplicates.
+    """Return welded vertices, the faces on them, and a mask of the faces that have an area and are not duplicates.
 
     The others are counted in the log.
 

@@ -154,7 +154,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         return spsolve(system.tocsc(), right)
 
     def displace(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
-        """Move the vertices along their nodes' normals, by a displacement in extents, and update the normals."""
+        """Move the vertices along their nodes' normals, by `displacement` times the extent, and update the normals."""
         weighted = area_vectors(self.mesh.vertices, self.mesh.faces)
         sums = [np.bincount(self.faces.reshape(-1), np.repeat(weighted[:, a], 3), self.nodes) for a in range(3)]
         # area-weighted normals of the nodes

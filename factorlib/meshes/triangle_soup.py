@@ -199,7 +199,7 @@ def text_lines(content: bytes) -> Iterator[str]:
     with io.TextIOWrapper(io.BytesIO(content), encoding) as text:  # line by line, since a list takes far more memory
         for line in text:
             if len(line) > LONGEST:
-                raise ValueError(f"a line of more than {LONGEST:,} letters")
+                raise ValueError(f"it has a line of more than {LONGEST:,} characters")
             yield line.rstrip("\n")
 
 
@@ -210,11 +210,11 @@ def parse_numbers(text: str | bytes) -> Float[np.ndarray, " n"]:
     [1.0, 2.5, -300.0]
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy only warns of text that is no number
+        warnings.simplefilter("error")  # NumPy only warns of text that is not a number
         try:
             return np.fromstring(text, dtype=float, sep=" ") if text.strip() else np.empty(0)
         except DeprecationWarning:
-            raise ValueError("something in it is no number") from None
+            raise ValueError("a word in it is not a number") from None
 
 
 def quoted(line: str) -> str:

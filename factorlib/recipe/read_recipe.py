@@ -139,7 +139,7 @@ def _check_new_object(
     if not is_mesh_file(recipe.mesh):
         refuse.check_known("mesh", recipe.mesh, [BALL, *meshes], "mesh")
     elif Path(recipe.mesh).suffix.lower() not in MESHES:
-        refuse("mesh", f"{recipe.mesh!r} is no mesh file that can be read", f"give one of {', '.join(MESHES)}")
+        refuse("mesh", f"{recipe.mesh!r} is not a mesh file that can be read", f"give one of {', '.join(MESHES)}")
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:

@@ -48,14 +48,14 @@ def page(
     surfaces: Sequence[Mapping[str, Any]] = (),
     first: Sequence[tuple[str, str, str]] = (),
 ) -> str:
-    """Return the page as HTML.
+    """Return the report's page as HTML.
 
     Args:
         run: results of the run
-        rows: the photos' rows
+        rows: pictures and errors of each photo
         tags: colours of the materials, by name
-        viewed: content of the relighting viewer
-        surfaces: the refined meshes
+        viewed: data of the relighting viewer (`factorlib.report.viewer.viewer_data`); None for no viewer
+        surfaces: a row for each refined mesh (`factorlib.report.pictures.surface_rows`)
         first: pictures of the first screen: title, `data:` URI, caption
     """
     metrics = run.metrics

@@ -166,7 +166,7 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
 
     Args:
         run: results of the run
-        rows: the photos' rows
+        rows: pictures and errors of each photo
         results: the solved data set
 
     Returns:

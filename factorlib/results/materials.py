@@ -129,7 +129,7 @@ class Tone(msgspec.Struct, frozen=True):
 
 
 class Decision(msgspec.Struct, frozen=True):
-    """Choice of a part of the model, and the evidence for it; None for what was not tried.
+    """Decision to include an optional part of the model or not, with its evidence; None for a measure not taken.
 
     Attributes:
         held_out_loss_with: geometric mean over lights of their mean losses with it; of held-out observations, but of

@@ -122,7 +122,7 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
         for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
                 raise InputError(
-                    "the pose is invalid: its rotation is no rotation matrix, or a number is not finite",
+                    "the pose is invalid: its rotation is not a rotation matrix, or a number is not finite",
                     file=path,
                     key=f"{key}.{name}",
                     cure=cure,

@@ -53,7 +53,7 @@ def read_earlier_solution(folder: Path) -> EarlierSolution:
     fault = None
     path = lobes
     if set(earlier.table.gauge.component) != set(earlier.table.materials):
-        fault = "`gauge.component` names other materials"
+        fault = "`gauge.component` does not name the same materials as `materials`"
         path = table
     for name, light in earlier.lights.items():
         finite = all(np.isfinite(part).all() for part in (light.axis, light.sharpness, light.weight))

@@ -18,7 +18,7 @@ class DetailEvidence(msgspec.Struct, frozen=True):
         held_out_loss_with: loss of their held-out observations with the refinement
         held_out_loss_without: loss of their held-out observations without it
         margin: difference of the logarithms, in standard errors
-        stiffness: the best of the values that were tried
+        stiffness: stiffness of the refinement, the best of the values that were tried
     """
 
     held_out_loss_with: float | None = None
@@ -43,7 +43,7 @@ class SurfaceTable(msgspec.Struct, frozen=True):
         gains: by photo: decrease of minus twice the log marginal likelihood of its observations, without a part in the
             surface
         displacements: by mesh: along the normal at each node of the subdivided mesh (`meshes.subdivision`), in
-            extents
+            units of the mesh's extent
         log_factors: by mesh: log factor on diffuse reflectance at each node
     """
 

@@ -2,7 +2,7 @@
 
 Each module is hashed by its syntax tree without comments and docstrings, so that a remark reruns nothing.  Imports
 count wherever they stand; modules named only at run time (`import_module(name)`) are not found.  Every data file beside
-an imported module, or in a folder beside it that is no package, counts too, but for temporary ones (`is_temporary`).
+an imported module, or in a folder beside it that is not a package, counts too, but for temporary ones (`is_temporary`).
 
 A module declares what else its numbers depend on in constants, which are read from its syntax tree:
 

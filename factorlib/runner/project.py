@@ -23,7 +23,7 @@ from factorlib.yamlfile import convert, parse_yaml, read_yaml
 DATASET_CURE = "name a folder in data/, or give the path of a folder with a dataset.yaml"
 PIPELINE = "pipeline.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
-RESERVED = ("studies", "bench", "store", "compare", "docs")  # folders of build/ that are no datasets
+RESERVED = ("studies", "bench", "store", "compare", "docs")  # folders of build/ that are not datasets
 LONGEST = 200  # bytes of the name of a dataset or recipe
 SHARED = "FACTORLIB_STORE"  # environment variable: folder of a store that several checkouts share
 ALL = "all"  # stands for all recipes
@@ -139,7 +139,7 @@ class Project(msgspec.Struct, frozen=True):
 
     @property
     def store(self) -> Path:
-        """Folder of the store: in `build`, or FACTORLIB_STORE; InputError if that is no folder."""
+        """Folder of the store: in `build`, or FACTORLIB_STORE; InputError if that is not a folder."""
         if not (name := os.environ.get(SHARED)):
             return self.build / "store"
         if not (folder := Path(name).expanduser()).is_dir():
@@ -403,7 +403,7 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
         stage, *names = target.split(".")
         if not equals or not all(names) or not 0 < len(names) <= DEEPEST:
             cure = 'write stage.parameter=value, as in SET="solve.cells=800"'
-            raise InputError(f"{one_line(word)!r} is no setting", key="SET", cure=cure)
+            raise InputError(f"{one_line(word)!r} is not a setting", key="SET", cure=cure)
         if stage not in stages:
             raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
         table = params = dict(stages[stage].params)

@@ -37,7 +37,7 @@ def no_runs(store: Store) -> Iterator[None]:
     """Keep runs from starting while the code inside deletes results; InputError if a run is going on."""
     with _entrance(store):
         if any(is_locked(folder / LOCK) for folder in store.tmp.iterdir()):
-            raise InputError("a run is going on", file=store.root, cure="wait until it has ended")
+            raise InputError("a run is using this store", file=store.root, cure="wait until it has ended")
         yield
 
 

@@ -63,7 +63,7 @@ def is_temporary(name: str) -> bool:
 
 
 class _Cache(msgspec.Struct, array_like=True):
-    """Content of the cache: by kind and path, the state of the file or tree and the value."""
+    """Content of the cache: by kind and path, the state of the file or tree and the value computed from it."""
 
     format: int = FORMAT
     values: dict[str, dict[str, tuple[Any, Any]]] = {}
@@ -98,14 +98,14 @@ class FileHashes:
         return value
 
     def recall(self, kind: str, path: Path | str, state: Any, type_: Any) -> Any:
-        """Return the value of a file, by its path, or of a tree, by its hash, in this state; None without one."""
+        """Return the value cached for a file (by path) or tree (by hash); None unless it was cached in this state."""
         with contextlib.suppress(KeyError, msgspec.ValidationError):  # missing, or damaged
             before, value = self._cache.values[kind][str(path)]
             return msgspec.convert(value, type_) if before == state else None
         return None
 
     def remember(self, kind: str, path: Path | str, state: Any, value: Any) -> None:
-        """Set the value of a file or tree in this state."""
+        """Cache the value that was computed from a file or tree in this state, such as size and times."""
         self._cache.values.setdefault(kind, {})[str(path)] = (state, value)
         self._changed = True
 

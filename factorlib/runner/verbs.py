@@ -286,7 +286,7 @@ def compare(project: Project, first: Path | None, second: Path | None) -> int:
         if not results.keys_file.is_file():
             known = [other.folder.name for other in all_results(project)]
             cure = did_you_mean(str(name), known) if known else "make all DATASET=<name> makes one"
-            raise InputError("is no folder of results", file=name, key="compare", cure=cure)
+            raise InputError("is not a folder of results", file=name, key="compare", cure=cure)
     page = import_module("factorlib.report.comparison").comparison(
         *(results.folder for results in pair), _changes(Store(project.store), *(results.keys() for results in pair))
     )

@@ -44,7 +44,7 @@ def visual_hull(
         outlines: Outlines, all with poses.
         cells: Number of grid cells along the longest side.
         parts: Number of parts of the object.
-        report: Function of the share that is done.
+        report: Called with the completed share, from 0 to 1.
 
     Returns:
         The mesh with its parts and its overlap with the outlines.

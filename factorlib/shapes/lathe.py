@@ -96,7 +96,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
 
     Args:
         outlines: Outlines of the object.
-        report: Function of the share that is done.
+        report: Called with the completed share, from 0 to 1.
 
     Returns:
         The mesh, in the frame of the poses if they are given, else centred at the origin.
@@ -162,7 +162,7 @@ def _plausible_bodies(outline: Outline) -> list[BodyView]:
 def _choose_tilt(
     starts: Sequence[tuple[Outline, Sequence[BodyView]]], judges: Sequence[Outline], report: Callable[[float], None]
 ) -> list[BodyView]:
-    """Choose the body whose tilt explains the outlines best and return its poses in the judging photos.
+    """Choose the body whose tilt explains the outlines best and return its poses in the photos of `judges`.
 
     A warning is logged if a wide range of tilts explains the outlines alike. `starts` holds outlines and bodies of
     different tilts that explain each.
@@ -351,7 +351,7 @@ def mesh_profile(profile: Profile) -> Triangles:
     if len(profile) < 3:
         raise InputError(
             "no body of revolution fits into its outlines",
-            cure="check that its masks and poses belong to one object, and that the y of its poses is its axis",
+            cure="check that its masks and poses belong to one object, which is round about the y axis of its poses",
         )
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     height = profile[::-1, :1]  # by descending height

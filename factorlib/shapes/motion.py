@@ -71,7 +71,7 @@ def cameras_by_motion(
 
     Args:
         photos: Photos by name.
-        report: Function of the share that is done and of the current step.
+        report: Called with the completed share, from 0 to 1, and the current step.
 
     Returns:
         Cameras of the registered photos by name.
@@ -117,7 +117,7 @@ def _map_photos(
     Args:
         photos: Photos by name.
         masks: Pixels of each photo where features are sought.
-        report: Function of the share that is done and of the current step.
+        report: Called with the completed share, from 0 to 1, and the current step.
 
     Returns:
         Cameras by photo, and the number of points; none if the cameras do not move with the objects.
@@ -214,7 +214,7 @@ def _reconstruct(
         root: Folder of the database and the images.
         images: Number of images.
         known_focals: Numbers of the cameras whose focal length is kept.
-        report: Function of the share that is done and of the current step.
+        report: Called with the completed share, from 0 to 1, and the current step.
 
     Returns:
         The model.

@@ -52,7 +52,7 @@ def primitive(
     Args:
         kind: "ball", "box" or "cylinder".
         outlines: Outlines, at least one, each with some pixel of the object.
-        report: Function of the share that is done.
+        report: Called with the completed share, from 0 to 1.
 
     Returns:
         The mesh with its overlap.
@@ -122,7 +122,7 @@ def fit_proportions(
 def jacobian_with_shape(
     state: PoseState, arms: Float[np.ndarray, "n 3"], free: Float[np.ndarray, "3 k"] = BOX
 ) -> Float[np.ndarray, "n 2 m"]:
-    """Return the derivative of image points, in photo pixels, by the unknowns of `PoseState.moved` and of the shape.
+    """Return the derivative of image points (photo pixels) by the unknowns of `PoseState.apply_step` and of the shape.
 
     Args:
         state: State of the mesh.

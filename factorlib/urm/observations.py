@@ -59,7 +59,7 @@ class Observations(msgspec.Struct, frozen=True):
     x, y          pixel
     weight        number of pixels that the row stands for, times their confidence
     visibility    visible share of each of k directions, 0 to 255; None if all are visible
-    met           codes of the surfaces that hide directions (`factorlib.geometry.sphere`)
+    occluder      codes of the surfaces that hide directions (`factorlib.geometry.sphere`); the file's column `met`
     exposures     t·S/N² of each photo from EXIF, None if it is unknown
     confidence    confidence of the normal, 0 to 1
     place         position as in `factorlib.light.distance`
@@ -280,14 +280,14 @@ def _rows_of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:
     """Convert a column of fixed-size binaries to one row of values each; ValueError for a fraction of a value."""
     k, over = divmod(column.type.byte_width, dtype.itemsize)
     if over:
-        raise ValueError(f"a binary of {column.type.byte_width} bytes holds no numbers of {dtype.itemsize}")
+        raise ValueError(f"a binary of {column.type.byte_width} bytes does not hold numbers of {dtype.itemsize} bytes")
     return np.frombuffer(column.buffers()[1], dtype).reshape(-1, k)[column.offset : column.offset + len(column)].copy()
 
 
 def _array(column: pa.Array, dtype: str, is_vector: bool) -> np.ndarray:
     """Convert a column to an array of the type `dtype`; ValueError for values that do not fit into it."""
     if pa.types.is_fixed_size_list(column.type) != is_vector or pa.types.is_string(column.type):
-        raise ValueError(f"a column is of type {column.type}")
+        raise ValueError(f"a column is of type {column.type}, not {'vectors of three ' if is_vector else ''}{dtype}")
     flat = column.flatten() if is_vector else column
     values = flat.cast(pa.from_numpy_dtype(np.dtype(dtype))).to_numpy(zero_copy_only=False)
     return values.reshape(-1, 3) if is_vector else values

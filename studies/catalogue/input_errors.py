@@ -99,7 +99,7 @@ ALIGNMENT_ERROR = Study(
 
 
 def progressive_settings(scale: Scale) -> list[Setting]:
-    """Return settings of more and more photos, then of the same from the solution before."""
+    """Return settings of more and more photos, first solved from nothing, then each from the previous solution."""
     n = scale.largest
     entries = [full_matrix(scale.side, k) for k in range(scale.largest + 1)]
     cold = [scale.object_setting(f"photos-{k}", str(k), entries[k]) for k in range(1, n + 1)]

@@ -128,7 +128,7 @@ SPEED_QUICK = ("default", "closed-form", "merge-4", "paper")
 
 
 def speed_settings(scale: Scale) -> list[Setting]:
-    """Return all of `VARIANTS`; of a quick study, those of `SPEED_QUICK`."""
+    """Return a setting for each of `VARIANTS`; for a quick study, those of `SPEED_QUICK`."""
     variants = {name: VARIANTS[name] for name in (SPEED_QUICK if scale.quick else VARIANTS)}
     return [
         scale.setting(name, label, full_matrix(2, 2), solve=parameters)
@@ -162,7 +162,7 @@ SPEED = Study(
 
 # ── parts ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-# label, what is off, of `CHANGES`, parameters of the stage
+# label, what is off, of `studies.steps.parts.CHANGES`, parameters of the stage
 WITHOUT: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "as-it-is": ("as it is", "", "", {}),
     "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
@@ -185,7 +185,7 @@ def parts_settings(scale: Scale) -> list[Setting]:
 
 
 def parts_sets(scale: Scale) -> dict[str, Any]:
-    """Return the rendered sets of chairs, one a seed: so many shots of so many pixels.
+    """Return the rendered sets of chairs, one for each seed, with numbers of shots and pixels by scale.
 
     They are small, since a study is of many solves.
     """

@@ -58,7 +58,7 @@ class PosedPhoto(NamedTuple):
 
 
 def posed_photo(kind: str, shape: str, seed: int, number: int) -> PosedPhoto:
-    """Return the photo of that kind; the same one for the same arguments."""
+    """Return a photo of a kind; equal arguments give the same photo."""
     rng = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode()))
     fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
     camera, pose, label = random_photograph(bodies.photographed_mesh(shape), rng, fill)
@@ -140,7 +140,7 @@ def normal_error_deg(truth: Maps, estimate: Maps) -> float:
 
 
 def share(flags: list) -> str:
-    """Count the flags that are set.
+    """Format the number of flags that are set, and their total.
 
     >>> share([True, False]), share([])
     ('1 of 2', '–')

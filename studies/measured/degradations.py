@@ -27,7 +27,7 @@ TRUTH = "truth/truth.yaml"
 
 
 def keep(spec: Spec, names: list[str]) -> None:
-    """Leave these photos alone in the set."""
+    """Remove all other photos from the set."""
     spec["photos"] = [photo for photo in spec["photos"] if photo["name"] in names]
 
 
@@ -58,18 +58,18 @@ def another_chair(folder: Path, spec: Spec, rng: Rng) -> None:
 
 
 def few(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Leave two to four photos."""
+    """Keep two to four photos, and remove the others."""
     names = [photo["name"] for photo in spec["photos"]]
     keep(spec, list(rng.permutation(names)[: rng.integers(2, 5)]))
 
 
 def one_photo(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Leave one photo of one chair."""
+    """Keep one photo of one chair, and remove the others."""
     keep(spec, [str(rng.choice([photo["name"] for photo in spec["photos"] if len(photo["objects"]) == 1]))])
 
 
 def unlinked(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Leave two photos of one chair each, of different colours, whose wood has two names: nothing links them."""
+    """Keep two photos of one chair each, of different colours, whose wood has two names: nothing links them."""
     names = [("garden", "office"), ("office", "patio"), ("kitchen", "garden"), ("kitchen", "office")][rng.integers(4)]
     keep(spec, list(names))
     spec["materials"].append("wood_2")
@@ -165,7 +165,7 @@ MIXED = (
 
 
 def degrade(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
-    """Write the set in `base`, degraded, as the folder, which is there when all of it is."""
+    """Write the set in `base`, degraded, to a new folder, which exists only once it is complete."""
     draft = folder.with_name(f"{folder.name}.new")
     shutil.rmtree(draft, ignore_errors=True)
     shutil.copytree(base, draft)
@@ -180,7 +180,7 @@ def degrade(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
 
 
 def truth_of(spec: Spec, truth: Spec) -> Spec:
-    """Return the truth of the photos and materials that are left: a material without a photo is not to be scored."""
+    """Return the truth of the remaining photos and their materials, because others are not to be scored."""
     names = [photo["name"] for photo in spec["photos"]]
     visible = {m for photo in spec["photos"] for obj in photo["objects"] for m in ("wood", *obj["materials"].values())}
     materials = {name: truth["materials"][name.removesuffix("_2")] for name in spec["materials"] if name in visible}
@@ -198,7 +198,7 @@ def relabel(folder: Path, photo: Spec, new: dict[int, int]) -> None:
 
 
 def expose(folder: Path, spec: Spec, factor: float) -> None:
-    """Expose all photos by a factor more; true lights are in the units of their photos."""
+    """Multiply the exposure of all photos by a factor, and their true lights, which are in the photos' units."""
     each_photo(folder, spec, lambda linear: linear * factor)
     for photo in spec["photos"]:
         file = folder / f"truth/{photo['name']}_light.exr"
@@ -206,7 +206,7 @@ def expose(folder: Path, spec: Spec, factor: float) -> None:
 
 
 def focal_of(picture: Image.Image) -> int | None:
-    """Return the focal length that the picture's EXIF gives, of 35 mm film; None where it gives none."""
+    """Return the focal length that the picture's EXIF gives, of 35 mm film; None if it gives none."""
     return picture.getexif().get_ifd(0x8769).get(0xA405)
 
 

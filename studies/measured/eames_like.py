@@ -97,7 +97,7 @@ class SetResult(NamedTuple):
     build: Path
 
     def value(self, path: str) -> float:
-        """Return a number of the metrics.  InputError where it is missing."""
+        """Return a number of the metrics.  InputError if it is missing."""
         if (value := value_at(self.metrics, path)) is None:
             cure = "correct QUANTITIES in studies/measured/eames_like.py"
             raise InputError("there is no such number", file=self.build / "evaluate/metrics.json", key=path, cure=cure)
@@ -109,7 +109,7 @@ class SetResult(NamedTuple):
 
 
 def generate_set(seed: int, lights: Path | None = None) -> Path:
-    """Return the folder of the set of that seed, generated where it is missing or factorlib/generate has changed."""
+    """Return the folder of the set of a seed; generate it if it is missing or if factorlib/generate has changed."""
     sources = sorted(path for path in (ROOT / "factorlib/generate").iterdir() if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
     folder = PLACE / digest / ("captured" if lights else "made") / f"eames-like-{seed}"
@@ -120,13 +120,13 @@ def generate_set(seed: int, lights: Path | None = None) -> Path:
 
 
 def split_maps(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]:
-    """Return the maps that light the set of that seed, and all others.
+    """Return the maps that light the set of a seed, and the remaining maps, for the prior.
 
-    Raises InputError where no two are left for a prior.
+    Raises InputError if no two are left for a prior.
     """
     if len(maps) < MAPS + 2:
         cure = f"{MAPS} light a set and the prior needs two more: name folders with {MAPS + 2}"
-        raise InputError(f"{len(maps)} maps", key="LIGHTS", cure=cure)
+        raise InputError(f"only {len(maps)} maps are named", key="LIGHTS", cure=cure)
     held_out = set(np.random.default_rng(seed).permutation(len(maps))[:MAPS].tolist())
     return [m for k, m in enumerate(maps) if k in held_out], [m for k, m in enumerate(maps) if k not in held_out]
 
@@ -164,7 +164,7 @@ def run_pipeline(name: str, dataset: Path, root: Path = ROOT) -> SetResult:
 
 
 def run_captured(seed: int, folders: Sequence[Path]) -> SetResult:
-    """Return the set of that seed in captured lights, solved under a prior that knows none of them."""
+    """Return the set of a seed in captured lights, solved under a prior that was fitted to other maps."""
     folder = PLACE / f"captured-{seed}"
     maps, others = split_maps(maps_in(folders), seed)
     print(f"set {seed} is lit by {', '.join(m.name for m in maps)}", flush=True)
@@ -182,7 +182,7 @@ def rows() -> Tables:
 
 
 def rows_of(results: Sequence[SetResult]) -> list[list[str]]:
-    """Return a column for each set, and mean and standard deviation over all but the first, which settings know.
+    """Return a column for each set, and mean and deviation over all but the first, on which settings were chosen.
 
     Brackets hold the null's score.
     """

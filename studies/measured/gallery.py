@@ -52,7 +52,7 @@ def figure(recipe: Path) -> str:
     """Write the picture of a recipe; return its HTML.
 
     The caption is the recipe's first line, a comment, and what the picture's parts are.
-    Raises InputError where the first line is no comment.
+    Raises InputError if the first line is not a comment.
     """
     first = recipe.read_text("utf-8").partition("\n")[0]
     if not first.startswith("# "):
@@ -81,7 +81,7 @@ def parts_of(folder: Path, files: list[Path]) -> str:
 
 
 def sheet(files: list[Path]) -> Image.Image:
-    """Return one picture, or four of one size two by two, on white: cropped to all that is opaque in any of them."""
+    """Return one picture, or four of one size two by two, on white, cropped to the pixels that any of them covers."""
     across = 1 if len(files) == 1 else 2
     pictures = [Image.open(file).convert("RGBA") for file in files]
     boxes = np.array([box for picture in pictures if (box := picture.getchannel("A").getbbox())])

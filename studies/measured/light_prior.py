@@ -14,7 +14,7 @@ distribution", 1989), in which a map of much contrast has little weight w:
     (3)
 
 over t = log of variance, decay, nugget, level and ν. X holds the profile's polynomials, and for y_0 a one: its mean is
-the maps' mean exposure, which is no property of light. For the same reason the level of y_0 is not fitted but wide,
+the maps' mean exposure, which is not a property of light. For the same reason the level of y_0 is not fitted but wide,
 EXPOSURE_VARIANCE.
 """
 
@@ -57,7 +57,7 @@ Logs = Float[np.ndarray, "3 m n"]  # y_0, y_1, y_2 of m maps in n cells
 
 
 def prior_of(paths: Sequence[Path], scored: bool = True) -> LightPrior:
-    """Fit the prior to the maps in some files, as it is shipped.
+    """Fit the prior to the maps in some files, in the form in which the package ships it.
 
     scored: with its leave-one-out scores, which take most of the time
     """
@@ -197,7 +197,7 @@ def log_likelihood(prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"
 
 
 def white_noise(prior: LightPrior) -> LightPrior:
-    """Return a prior with the variance of a cell, the level and the profile of another, but independent cells."""
+    """Return another prior with independent cells; the variance of a cell, level and profile are unchanged."""
     nugget = tuple(v + n for v, n in zip(prior.variance, prior.nugget, strict=True))
     return msgspec.structs.replace(prior, variance=(0.0, 0.0, 0.0), nugget=nugget)
 

@@ -40,7 +40,7 @@ COLUMNS = ("material", "k_s_r", "k_s_g", "k_s_b", "k_s", "roughness")
 def classes_of(path: Path) -> Classes:
     """Return means and covariances of the three classes.
 
-    Raises InputError where the file has not the columns, or a class no four rows.
+    Raises InputError if a column is missing, or a class has fewer than four rows.
     """
     content = read_bytes(path, "a table of materials")
     rows = list(csv.DictReader(io.StringIO(content.decode("utf-8", "replace"))))

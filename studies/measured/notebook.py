@@ -15,7 +15,7 @@ PAGE = ROOT / "docs" / "result.ipynb"
 def write() -> Path:
     """Run all cells in docs/ and write the notebook with what they show, without times and versions; returns its path.
 
-    Raises InputError where what runs notebooks is not installed, and CellExecutionError where a cell fails.
+    Raises InputError if what runs notebooks is not installed, and CellExecutionError if a cell fails.
     """
     try:
         import nbformat

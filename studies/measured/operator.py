@@ -63,7 +63,7 @@ def variants() -> dict[str, Operator]:
 
 
 def label_of(label: str) -> str:
-    """Return the label as tables have it."""
+    """Format the label of an operator for tables."""
     return label.replace("_", " ").replace("float", "f")
 
 

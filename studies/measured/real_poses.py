@@ -109,7 +109,7 @@ def about_the_ray(pose: Pose, centre: Float[np.ndarray, "3"]) -> Float[np.ndarra
 
 
 def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:
-    """Return the angle of the mean of rotation vectors, and what is left of each without it, degrees.
+    """Return the angle of the mean of rotation vectors, and the angle of each vector less that mean, degrees.
 
     >>> [round(float(angle), 6) for angle in common_turn([[0, 0, 0.1], [0, 0, 0.3]])[1]]
     [5.729578, 5.729578]

@@ -27,7 +27,7 @@ def rows_of(name: str, metrics: Metrics) -> list[list[str]]:
 
 
 def rows() -> Tables:
-    """Return the rows of all folders.  InputError where none is named."""
+    """Return the rows of all folders.  InputError if none is named."""
     folders = [Path(word).resolve() for word in environment_words("REAL", "folders of photographs")]
     lines = [row for f in folders for row in rows_of(f.name, msgspec.convert(evaluate_dataset(f), Metrics))]
     return {"Re-synthesis": [HEAD, *lines]}

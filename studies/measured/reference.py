@@ -105,7 +105,7 @@ class Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def tolerance(values: Sequence[float], doubt: float = DOUBT) -> float:
-    """Return the tolerance of a number that has these values with some seeds.
+    """Return the tolerance of a number, given its values with several seeds.
 
     >>> round(tolerance([0.0, 1.0, 2.0, 3.0, 4.0]), 3)
     10.295
@@ -114,7 +114,7 @@ def tolerance(values: Sequence[float], doubt: float = DOUBT) -> float:
 
 
 def metric_numbers(metrics: object) -> dict[str, float | None]:
-    """Return the NUMBERS in what a metrics.json holds; None for each that is missing."""
+    """Return the NUMBERS of the content of a metrics.json; None for each that is missing."""
     return {path: value_at(metrics, path) for path in NUMBERS}
 
 
@@ -163,7 +163,7 @@ def differences(values: dict[str, float | None], stored: Stored) -> dict[str, st
 
 
 def complaint(lines: dict[str, str]) -> str:
-    """Describe the differences, and what to do about them."""
+    """Format the differences as a message, with what to do about them."""
     listed = "\n".join(f"  {line}" for line in lines.values())
     return (
         f"{len(lines)} number(s) of data/{DATASET} are not those stored:\n{listed}\n"
@@ -177,7 +177,7 @@ def read_stored(name: str = DATASET) -> Stored:
 
 
 def summarise(runs: Sequence[dict[str, float | None]], reason: str, before: Stored | None) -> Stored:
-    """Return the numbers of runs with several seeds, the default one first.  InputError where a number is missing."""
+    """Return the numbers of runs with several seeds, the default one first.  InputError if a number is missing."""
     values = {path: [run.get(path) for run in runs] for path in runs[0]}
     if missing := [path for path, samples in values.items() if None in samples]:
         raise InputError(

@@ -50,7 +50,7 @@ def section(name: str, tables: Tables, measured: str) -> str:
 def main() -> int:
     """Measure the sections that ONLY names, or all, and write each as soon as it is measured.
 
-    Returns 1 where one is left as it was.
+    Returns 1 if a section could not be measured and is unchanged.
     """
     known = [*PAGES, *SECTIONS]
     names = os.environ.get("ONLY", "").split() or known

@@ -32,7 +32,7 @@ PARTS = ("diffuse", "specular", "roughness")
 def material_deviations(build: Path, other: Path | None = None) -> dict[str, Float[np.ndarray, " n"]]:
     """Return |estimate − truth| over the standard error by part, of all materials, after the free factor per channel.
 
-    other: results that stand in for the truth, of a data set of one connected component.  InputError where there is no
+    other: results that stand in for the truth, of a data set of one connected component.  InputError if there is no
            truth
     """
     solved = read_materials(build / "export/materials.json").materials

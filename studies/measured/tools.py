@@ -18,7 +18,7 @@ Tables = dict[str, list[list[str]]]  # title -> rows of cells, the head first
 
 
 def format_number(value: float, digits: int = 2) -> str:
-    """Format the value with that many significant digits, and a power of ten where it is tiny or huge.
+    """Format a value with `digits` significant digits, and a power of ten if it is tiny or huge.
 
     >>> format_number(0.00123), format_number(0.000012), format_number(0.0), format_number(12.3), format_number(48000.0)
     ('0.0012', '1.2·10⁻⁵', '0', '12', '4.8·10⁴')
@@ -50,7 +50,7 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def value_at(metrics: Any, path: str) -> float | None:
-    """Return the number at a dotted path into metrics.json; None where there is nothing.
+    """Return the number at a dotted path into metrics.json; None if there is none.
 
     >>> value_at({"a": {"b": [1.5]}}, "a.b.0"), value_at({"a": None}, "a.b")
     (1.5, None)
@@ -66,7 +66,7 @@ def value_at(metrics: Any, path: str) -> float | None:
 def replace_sections(path: Path, parts: dict[str, str]) -> None:
     """Write each part into the file, between `<!-- begin name -->` and `<!-- end name -->`.
 
-    Raises InputError where these marks are missing.
+    Raises InputError if these marks are missing.
     """
     text = path.read_text(encoding="utf-8")
     for name, inner in parts.items():
@@ -79,9 +79,9 @@ def replace_sections(path: Path, parts: dict[str, str]) -> None:
 
 
 def environment_words(name: str, meaning: str) -> list[str]:
-    """Return the words of the environment variable of that name; meaning: of the words, in the plural.
+    """Return the words in an environment variable; `meaning` says what they name, in the plural, for the error.
 
-    Raises InputError where there are none.
+    Raises InputError if there are none.
     """
     if not (words := os.environ.get(name, "").split()):
         raise InputError(f"no {meaning} are named", key=name, cure=f'add {name}="… …"')

@@ -48,7 +48,7 @@ class VerdictOnSet(NamedTuple):
 
 
 def measure(kind: str) -> list[VerdictOnSet]:
-    """Degrade the sets that are not there, run the pipeline on them, and read the verdicts."""
+    """Make the degraded sets that are missing, run the pipeline on all, and read the verdicts."""
     rng = np.random.default_rng(ORDER[kind])
     seeds = SEEDS[kind] * TIMES
     ways = []
@@ -102,7 +102,7 @@ def agreement(predicted: Float[np.ndarray, " n"], sets: list[VerdictOnSet]) -> s
 
 
 def main() -> None:
-    """Print the verdicts on each kind of sets that is named, and write the scores of all."""
+    """Print the verdicts on the kinds of sets named on the command line, and write the scores of all."""
     kinds = {kind: measure(kind) for kind in sys.argv[1:] or SEEDS}
     for kind, sets in kinds.items():
         ranked = sorted(sets, key=lambda each: -each.expected)

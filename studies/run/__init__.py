@@ -2,8 +2,8 @@
 
 Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
 (`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
-build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  What the cases come to is no step:
-it is written anew after each run (`studies.run.tables`), for it takes a second.
+build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  The conclusion from the cases is
+not a step: it takes a second and is written anew after each run (`studies.run.tables`).
 """
 
 from collections.abc import Callable
@@ -46,7 +46,7 @@ class Studies(Project, frozen=True):
         return folder / "quick" if self.scale.quick else folder
 
     def dataset_folder(self, name: str) -> Path:
-        """Return a folder that stands for a study; nothing lies there.  InputError where no study is called so."""
+        """Return the path that identifies a study, where no folder exists.  InputError for an unknown study."""
         if name not in STUDIES:
             raise InputError(f"there is no study {name!r}", key="STUDY", cure=did_you_mean(name, STUDIES))
         return self.root / "studies" / name
@@ -76,13 +76,13 @@ def data_of(folder: Path, scale: Scale) -> Data:
 def make(
     scale: Scale, names: list[str], force: bool = False, settings: list[str] | None = None, root: Path = LIBRARY
 ) -> int:
-    """Run studies as far as anything must run.
+    """Run the steps of studies that are not current.
 
     Their results and the page of all that are done lie in build/studies afterwards.
 
     settings: where their steps run, as `executor=tcp://…`
 
-    A study that fails holds up no other.  Returns the exit code of the first that failed, 0 where none did.
+    A failed study does not stop the others.  Returns the exit code of the first failed study; 0 if none failed.
     """
     codes = []
     for name in names:
@@ -103,7 +103,7 @@ def make(
 
 
 def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
-    """Forget the results of studies; `collect` frees what they took.  Returns 0."""
+    """Forget the results of studies; `collect` then frees their disk space.  Return 0."""
     from studies.run.tables import FILES, write_index
 
     project = studies(scale, root)
@@ -117,7 +117,7 @@ def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
 
 
 def collect(agreed: Callable[[], bool]) -> int:
-    """Show which results no study names any more, and delete them where that is `agreed`.  Returns 0."""
+    """List the results that no study names any more, and delete them if `agreed` returns True.  Return 0."""
     for project in (studies(FULL), studies(QUICK)):
         if (project.build / "store").is_dir():
             print(f"{project.short_path(project.build)}:")

@@ -9,4 +9,4 @@ import msgspec
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Nothing to choose: the case says all."""
+    """Empty parameters: the case sets everything."""

@@ -67,7 +67,7 @@ class PredictedPhoto(msgspec.Struct, frozen=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Compare with the truth."""
+    """Compare the predictions of a method with the true pictures, and write the scores."""
     case = msgspec.convert(inputs.facts["dataset.case"], Comparison)
     numbers = range(msgspec.convert(inputs.facts["dataset.worlds"], World).lights)
     truths = materials_of(case.seed)

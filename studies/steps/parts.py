@@ -28,7 +28,7 @@ CHANGES = {  # of the observations
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Solve and compare."""
+    """Solve a rendered set without one part of the model, compare with the truth, and write the scores."""
     case = inputs.facts["dataset.case"]
     home = inputs["rendered_sets"] / str(case["seed"])
     dataset = read_dataset(home / "data")

@@ -54,7 +54,7 @@ LEAST = 1e-3  # of a reflectance, below which a relative standard error means no
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Compare with all lights of the world."""
+    """Compare the answer of a case with all materials and lights of its world, and write the scores."""
     case = msgspec.convert(inputs.facts["dataset.case"], Case)
     world = msgspec.convert(inputs.facts["dataset.worlds"], World)
     folder = inputs["solve"] / inputs.photo
@@ -68,7 +68,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def score_case(
     case: Case, truths: Materials, maps: Maps, solved: Mapping[str, SolvedMaterial], recovered: Maps
 ) -> Score:
-    """Return all scores.
+    """Return all scores of a case.
 
     Args:
         case: Case that was solved.

@@ -1,8 +1,8 @@
-"""The stage `solve` itself on what a case observes: writes into <case>/ what that stage writes, and measured.json.
+"""Run of the stage `solve` on the observations of a case: writes that stage's files and measured.json into <case>/.
 
-measured.json holds the processor seconds of the solve, of all threads, from observations as they lie on disk to
-materials and lights as they lie there, and of objects the mean error of the normals given.  Seconds are a measurement:
-they differ from run to run.  A solve to start from does not count in them.
+measured.json holds the processor seconds of the solve, summed over threads, from reading the observations to writing
+materials and lights.  For objects it also holds the mean error of the given normals.  Seconds are a measurement: they
+differ from run to run.  An earlier solve to start from does not count in them.
 """
 
 import time

@@ -1,4 +1,4 @@
-"""The lights of all worlds that a study shows: writes <seed>-<light>.exr, lat-long, mean radiance 1.
+"""Lights of all worlds that a study uses: writes <seed>-<light>.exr, lat-long, mean radiance 1.
 
 Mitsuba's scalar variant traces, which every machine has: the faster one gives other noise, and so other worlds.
 """
@@ -16,7 +16,7 @@ from studies.study import World
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Trace every light."""
+    """Render and write the map of every light."""
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # read where Mitsuba is first used
     world = msgspec.convert(inputs.facts["dataset.worlds"], World)
     lights = [(seed, light) for seed in world.seeds for light in range(world.lights)]

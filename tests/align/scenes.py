@@ -73,6 +73,6 @@ def true_silhouette(caster: Caster, camera: Camera, pose: Pose) -> Silhouette:
 
 def normal_error_deg(caster, camera, pose, found_camera, found_pose, given=None) -> float:
     """Median over the true silhouette; a pixel that the mesh given misses in the pose found counts as 180°."""
-    truth, found = rasterise(caster, camera, pose), rasterise(given or caster, found_camera, found_pose)
-    angle = np.rad2deg(np.arccos(np.clip(np.sum(truth.normal * found.normal, axis=-1), -1, 1)))
-    return float(np.median(np.where(found.label > 0, angle, 180.0)[truth.label > 0]))
+    truth, estimate = rasterise(caster, camera, pose), rasterise(given or caster, found_camera, found_pose)
+    angle = np.rad2deg(np.arccos(np.clip(np.sum(truth.normal * estimate.normal, axis=-1), -1, 1)))
+    return float(np.median(np.where(estimate.label > 0, angle, 180.0)[truth.label > 0]))

@@ -37,9 +37,9 @@ def searched(mesh, seed, mask=None, given=None, known=True, search=QUICK, **how)
     silhouette, given = true_silhouette(caster, camera, pose), given or caster
     silhouette = mask(silhouette) if mask else silhouette
     view = ObjectView(silhouette, *with_prior_focal(camera, camera.focal if known else None, "dataset"))
-    found = estimate_pose(given, view, search, (shares := []).append)
+    estimate = estimate_pose(given, view, search, (shares := []).append)
     assert shares == sorted(set(shares)) and len(shares) == 5  # first guesses, and four rounds
-    return found, normal_error_deg(caster, camera, pose, found.state.camera(camera), found.state.pose(given))
+    return estimate, normal_error_deg(caster, camera, pose, estimate.state.camera(camera), estimate.state.pose(given))
 
 
 def answered(mesh, seed=21, mask=None, given=None, known=True, **how):
@@ -58,9 +58,9 @@ def answered(mesh, seed=21, mask=None, given=None, known=True, **how):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_any_rotation_with_the_focal_length_unknown(seed):
     mesh, focal = [blob(), chair()][seed % 2], [0.9, 1.4, 2.2][seed]
-    found, error = searched(mesh, seed, known=False, search=SearchOptions(), focal=focal, shift=(0.05, -0.04))
-    assert error < 2 and found.score > 0.98
-    assert abs(found.state.log_focal - np.log(focal * 320)) < max(3 * found.log_focal_sigma, 0.05)
+    estimate, error = searched(mesh, seed, known=False, search=SearchOptions(), focal=focal, shift=(0.05, -0.04))
+    assert error < 2 and estimate.score > 0.98
+    assert abs(estimate.state.log_focal - np.log(focal * 320)) < max(3 * estimate.log_focal_sigma, 0.05)
 
 
 def test_mask_cut_by_the_frame():
@@ -80,15 +80,15 @@ def test_what_is_left_out_is_unknown_not_background():
 
 def test_labels_settle_what_the_shape_cannot():
     """The photo shows the ends the other way round than the second mesh: the pose turns by half a turn."""
-    found, error = searched(dumbbell((1, 2)), 10)
+    estimate, error = searched(dumbbell((1, 2)), 10)
     other, _ = searched(dumbbell((1, 2)), 10, given=Caster(dumbbell((2, 1))), **SMALL)
-    assert error < 2 and found.score > 0.97 and angle_between(found.state.rotation, other.state.rotation) > 60
+    assert error < 2 and estimate.score > 0.97 and angle_between(estimate.state.rotation, other.state.rotation) > 60
 
 
 def test_a_sphere_is_believed_though_its_turn_is_unknown():
-    error, reasons, found = answered(mesh_of([ball()]), known=False)
+    error, reasons, estimate = answered(mesh_of([ball()]), known=False)
     assert error < 2 and not reasons
-    assert found.runner_up.score > 0.97 and found.runner_up.normal_difference_deg < 3
+    assert estimate.runner_up.score > 0.97 and estimate.runner_up.normal_difference_deg < 3
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -14,10 +14,10 @@ def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_
     (tmp_path / "pipeline.yaml").write_text((LIBRARY / "pipeline.yaml").read_text())
     (tmp_path / "stages").symlink_to(LIBRARY / "stages")
     folder = sample.make_set(tmp_path / "data" / "set")
-    project, sheet, done = Project(tmp_path, photo_sets()), tmp_path / "build" / "set" / "sheet.png", []
+    project, sheet, reports = Project(tmp_path, photo_sets()), tmp_path / "build" / "set" / "sheet.png", []
     assert verbs.validate(project, str(folder), [], sheet=True) == 0 and "contact sheet" in capsys.readouterr().out
-    write_sheet(folder, tmp_path / "again.png", lambda k, total: done.append((k, total)))
-    assert sheet.read_bytes() == (tmp_path / "again.png").read_bytes() and done == [(k, 4) for k in range(4)]
+    write_sheet(folder, tmp_path / "again.png", lambda k, total: reports.append((k, total)))
+    assert sheet.read_bytes() == (tmp_path / "again.png").read_bytes() and reports == [(k, 4) for k in range(4)]
     file = folder / "dataset.yaml"  # the same, as far as it goes, of one that is not finished
     file.write_text(re.sub("masks: .*", 'masks: "?"', file.read_text(), count=1))
     refusal("left open", verbs.validate, project, str(folder), [], sheet=True)

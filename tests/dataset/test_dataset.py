@@ -137,10 +137,10 @@ def test_truth_is_its_own_slice_and_a_warning_where_it_is_missing(folder, caplog
     assert truth.files == ["truth/garden.exr"]
     assert msgspec.convert(truth.facts, schema.TruthFile).materials["red"].roughness == 0.3
     assert all(dataset_slice(plain, name) == dataset_slice(dataset, name) for name in SLICES if name != "truth")
-    for gone in ("truth/garden.exr", "truth/truth.yaml"):
-        (folder / gone).unlink()
+    for missing in ("truth/garden.exr", "truth/truth.yaml"):
+        (folder / missing).unlink()
         with caplog.at_level(logging.WARNING):
-            assert dataset_slice(read_dataset(folder), "truth").facts is None and gone in caplog.text
+            assert dataset_slice(read_dataset(folder), "truth").facts is None and missing in caplog.text
 
 
 @pytest.mark.parametrize("truth, key, cure", [
@@ -225,7 +225,7 @@ BAD = [
     ("known > .illumination.kitchn", {"illumination": {"kitchn": "map.exr"}}, "did you mean 'kitchen'"),
     ("known > .illumination.kitchen", {"illumination": {"kitchen": "kitchen.png"}}, ".exr, .hdr"),
     ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "bal"}}}, "unknown object 'bal'"),
-    ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "chair_1"}}}, "no ball of one"),
+    ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "chair_1"}}}, "not a ball of one"),
     ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "vase_1"}}}, "white' too"),
     ("known > .illumination.hall.chrome", {"illumination": {"hall": {"chrome": "box_1"}}}, "specular reflectance of"),
     ("known > .exposure.hal", {"exposure": {"hal": 1}}, "did you mean 'hall'"),
@@ -264,7 +264,7 @@ def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(fold
     spec["meshes"]["box"] = {"file": "box.obj", "material": "wood"}
     faults = Validation(read_dataset(write(folder, spec))).faults("known", None, {}, folder)
     assert [fault.key for fault in faults] == ["known.illumination.garden", "known.illumination.kitchen.chrome"]
-    assert "it is no ball" in str(faults[1])
+    assert "it is not a ball" in str(faults[1])
     spec["materials"].append("gold")
     spec["known"]["materials"]["gold"] = {"diffuse": [0.5, 0.4, 0.1]}
     refusal("no object is made of material 'gold'", read_dataset, write(folder, spec))

@@ -85,7 +85,7 @@ def test_a_coco_file_names_the_materials_of_all_photos_and_what_is_no_name_is_to
     dataset = read_dataset(folder / "data" / "mine")
     arguments = "photo", None, {}, folder / "pipeline.yaml"
     faults = Validation(dataset).faults(*arguments)
-    assert ["category 'red shell' is no material" in str(fault) for fault in faults] == [True, True]
+    assert ["category 'red shell' is not a material" in str(fault) for fault in faults] == [True, True]
     file = folder / "data" / "mine" / "masks" / "all.json"
     file.write_text(file.read_text().replace("red shell", "red_shell"))
     assert Validation(dataset).faults(*arguments) == []

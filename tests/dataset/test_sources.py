@@ -78,8 +78,8 @@ def colmap(folder, names=("hall.png", "attic.png"), form="binary", model="SIMPLE
 
 def is_pose_of(external, image):
     rigid, pose = image.cam_from_world(), external.poses["chair"]
-    theirs = np.column_stack([rigid.rotation.matrix(), rigid.translation])
-    return np.allclose(np.column_stack([pose.rotation, pose.translation]), theirs, atol=1e-14)
+    expected = np.column_stack([rigid.rotation.matrix(), rigid.translation])
+    return np.allclose(np.column_stack([pose.rotation, pose.translation]), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])

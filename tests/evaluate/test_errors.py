@@ -40,9 +40,11 @@ def test_normals_by_hand_and_only_where_both_are_known():
     truth[..., 2] = -1.0
     estimate = truth.copy()
     estimate[0, 0], estimate[1, 1] = [0.0, np.sin(0.1), -np.cos(0.1)], 0.0
-    found = normal_error(estimate, truth, np.ones((2, 2), bool))
-    assert found.pixels == 3 and found.estimate.median_deg == 0
-    assert found.estimate.p90_deg == pytest.approx(0.8 * np.degrees(0.1))  # linear between the 2nd and the 3rd of three
+    result = normal_error(estimate, truth, np.ones((2, 2), bool))
+    assert result.pixels == 3 and result.estimate.median_deg == 0
+    assert result.estimate.p90_deg == pytest.approx(
+        0.8 * np.degrees(0.1)
+    )  # linear between the 2nd and the 3rd of three
     assert normal_error(estimate * 0, truth, np.ones((2, 2), bool)) is None
 
 
@@ -52,9 +54,9 @@ ONE = dict.fromkeys(TRUE, 0)
 
 
 def test_a_factor_per_channel_and_component_is_no_error():
-    found = compare_materials({n: scaled(m, (2.0, 0.5, 3.0)) for n, m in TRUE.items()}, TRUE, ONE)
-    assert found.factor["0"] == pytest.approx((0.5, 2.0, 1 / 3))
-    assert found.worst_diffuse == pytest.approx(0, abs=1e-12) and found.worst_specular == pytest.approx(0, abs=1e-12)
+    result = compare_materials({n: scaled(m, (2.0, 0.5, 3.0)) for n, m in TRUE.items()}, TRUE, ONE)
+    assert result.factor["0"] == pytest.approx((0.5, 2.0, 1 / 3))
+    assert result.worst_diffuse == pytest.approx(0, abs=1e-12) and result.worst_specular == pytest.approx(0, abs=1e-12)
     component = {"red": 0, "white": 0, "brass": 1, "black": 1}
     estimates = {n: scaled(m, 1.0 + component[n]) for n, m in TRUE.items()}
     assert compare_materials(estimates, TRUE, component).worst_diffuse == pytest.approx(0, abs=1e-12)
@@ -62,10 +64,10 @@ def test_a_factor_per_channel_and_component_is_no_error():
 
 
 def test_errors_are_the_perturbation_and_the_null_is_what_a_grey_ball_would_score():
-    found = compare_materials({n: perturbed(m, 1.0) for n, m in TRUE.items()}, TRUE, ONE)
+    result = compare_materials({n: perturbed(m, 1.0) for n, m in TRUE.items()}, TRUE, ONE)
     # diffuse ×1.04, specular ×0.95: the common factor cannot take away the ratio 1.04 / 0.95
-    red = found.materials["red"].error
-    assert red.roughness == pytest.approx(0.02) and found.mean_diffuse < found.null_mean_diffuse
+    red = result.materials["red"].error
+    assert red.roughness == pytest.approx(0.02) and result.mean_diffuse < result.null_mean_diffuse
     assert (1 + red.diffuse[0]) / (1 + red.specular[0]) == pytest.approx(1.04 / 0.95)
     null = compare_materials(TRUE, TRUE, ONE).materials["black"].null
     # red channel: true diffuse + specular .56 .65 .55 .06, grey's .55: the median ratio is .555 / .55
@@ -76,8 +78,8 @@ def test_errors_are_the_perturbation_and_the_null_is_what_a_grey_ball_would_scor
 def test_unseen_and_untold_materials_are_left_out_and_black_has_no_infinite_error():
     assert set(compare_materials(TRUE, TRUE, {"red": 0}).materials) == {"red"} and not compare_materials(TRUE, {}, ONE)
     estimate, truth = (Reflectance((0.5,) * 3, (specular, 0.0, 0.0), 0.5) for specular in (0.005, 0.0))
-    found = compare_materials({"chalk": estimate}, {"chalk": truth}, {"chalk": 0})
-    assert found.materials["chalk"].error.specular[0] == pytest.approx(0.5, rel=0.3)
+    result = compare_materials({"chalk": estimate}, {"chalk": truth}, {"chalk": 0})
+    assert result.materials["chalk"].error.specular[0] == pytest.approx(0.5, rel=0.3)
 
 
 # ── lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -197,9 +199,9 @@ def plain_quadrature(radiance, normals, diffuse, specular, roughness=0.5):
 def test_the_glossy_ball_is_the_plain_quadrature(sharpness, roughness):
     radiance, some = lobe_map(sharpness), NORMALS[::9]
     expected = plain_quadrature(radiance, some, 0.0, 1.0, roughness)
-    found = glossy_lobe(some, roughness)(octahedral_light(radiance))
-    assert np.median(np.abs(found / expected - 1)) < 0.01
-    assert np.abs(found - expected).max() < 0.03 * expected.max()
+    result = glossy_lobe(some, roughness)(octahedral_light(radiance))
+    assert np.median(np.abs(result / expected - 1)) < 0.01
+    assert np.abs(result - expected).max() < 0.03 * expected.max()
 
 
 def test_the_matte_ball_is_the_plain_quadrature():
@@ -233,11 +235,11 @@ def lit(factor):
 
 
 def test_the_truth_is_perfect_and_beats_its_nulls_and_unseen_pairs_are_told_apart():
-    found = compare_relighting(PAIR, PAIR, LIGHTS, LIGHTS, SEEN)
-    for kinds in found.mean.values():
+    result = compare_relighting(PAIR, PAIR, LIGHTS, LIGHTS, SEEN)
+    for kinds in result.mean.values():
         assert kinds["in_true_light"].psnr_linear_db == kinds["in_estimated_light"].psnr_linear_db == 120
         assert kinds["null_grey"].psnr_tonemapped_db < 40 and kinds["null_mean_colour"].psnr_tonemapped_db < 40
-    assert found.balls["a"]["red"].observed and not found.balls["a"]["brass"].observed and found.mean_unobserved
+    assert result.balls["a"]["red"].observed and not result.balls["a"]["brass"].observed and result.mean_unobserved
     assert compare_relighting(PAIR, PAIR, LIGHTS, LIGHTS, dict.fromkeys(LIGHTS, tuple(PAIR))).mean_unobserved is None
     scored = compare_relit_set(PAIR, PAIR, LIGHTS, LIGHTS)
     assert scored.mean_psnr_db == scored.worst_psnr_db == 120 and scored.pairs == 4 and scored.factor == (1, 1, 1)
@@ -247,8 +249,8 @@ def test_the_truth_is_perfect_and_beats_its_nulls_and_unseen_pairs_are_told_apar
 def test_a_factor_between_materials_and_lights_changes_nothing_but_itself_and_an_exposure_is_none():
     factor = np.array([2.0, 0.5, 3.0])
     materials, lights = {n: scaled(m, factor) for n, m in WRONG.items()}, lit(1 / factor)
-    plain, found = compare_relit_set(WRONG, PAIR, LIGHTS, LIGHTS), compare_relit_set(materials, PAIR, lights, LIGHTS)
-    assert found.factor == pytest.approx(tuple(np.array(plain.factor) / factor), rel=1e-6)
-    scores = [(f.mean_psnr_db, f.worst_psnr_db, f.null_mean_psnr_db) for f in (found, plain)]
-    assert scores[0] == pytest.approx(scores[1], abs=1e-3) and found.worst_material == plain.worst_material
+    plain, result = compare_relit_set(WRONG, PAIR, LIGHTS, LIGHTS), compare_relit_set(materials, PAIR, lights, LIGHTS)
+    assert result.factor == pytest.approx(tuple(np.array(plain.factor) / factor), rel=1e-6)
+    scores = [(f.mean_psnr_db, f.worst_psnr_db, f.null_mean_psnr_db) for f in (result, plain)]
+    assert scores[0] == pytest.approx(scores[1], abs=1e-3) and result.worst_material == plain.worst_material
     assert compare_relit_set(PAIR, PAIR, lit(1.2), LIGHTS).mean_psnr_db < 35

@@ -57,11 +57,11 @@ def test_every_part_is_scored_beside_its_null_in_finite_numbers(linked):
 
 
 def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
-    found = metrics_of(tmp_path, seen={"only": ["red"]}, truth=False)
-    assert found["materials"] is found["light"] is found["relighting"] is found["relit_set"] is None
-    assert set(found["reasons"].values()) == {evaluate.NO_TRUTH}
-    assert found["resynthesis"]["mean"]["none"]["estimate"]["psnr_linear_db"] > 20
-    assert found["verdict"]["trust"] == "good"
+    result = metrics_of(tmp_path, seen={"only": ["red"]}, truth=False)
+    assert result["materials"] is result["light"] is result["relighting"] is result["relit_set"] is None
+    assert set(result["reasons"].values()) == {evaluate.NO_TRUTH}
+    assert result["resynthesis"]["mean"]["none"]["estimate"]["psnr_linear_db"] > 20
+    assert result["verdict"]["trust"] == "good"
     assert (tmp_path / "out" / "verdict.txt").read_text().startswith("good: relit pictures are expected to reach ")
 
 
@@ -108,7 +108,7 @@ def test_a_worse_sign_never_raises_what_is_expected():
 
 def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size_change():
     errors = StandardErrors((0.01, 0.004, 0.004), (0.004,) * 3, 0.01)
-    (found,) = ball_changes({"red": attach_errors(TRUE["red"], errors)}, {"day": LIGHT}).values()
+    (result,) = ball_changes({"red": attach_errors(TRUE["red"], errors)}, {"day": LIGHT}).values()
 
     def shown(material: Reflectance) -> np.ndarray:
         return np.clip(ball(LIGHT, material, NORMALS) * exposure, 0, 1) ** (1 / 2.2)
@@ -123,7 +123,7 @@ def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size
             TRUE["red"].roughness + errors.roughness * c,
         )
         squares.append(np.mean((shown(moved) - shown(TRUE["red"])) ** 2))
-    assert found == pytest.approx(np.mean(squares), rel=4 / np.sqrt(60))
+    assert result == pytest.approx(np.mean(squares), rel=4 / np.sqrt(60))
     nothing = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
     assert ball_changes(
         {"red": attach_errors(TRUE["red"], nothing)}, {"day": LIGHT, "grey": uniform_light(np.ones(3))}

@@ -162,8 +162,8 @@ def test_factor_leaves_headroom_and_touches_nothing_that_has_it(scale):
 def test_gauge_scales_reflectances_and_their_errors_only_and_says_so():
     before = attach_errors(Reflectance((0.8,) * 3, (0.4,) * 3, 0.3), StandardErrors((0.1,) * 3, (0.2,) * 3, 0.05))
     half = attach_errors(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))
-    found = table_in_gauge(MaterialTable({"a": before}, Gauge(rule="x")), 0.5)
-    assert found.materials == {"a": half} and found.gauge.rule == "x" and found.gauge.export_factor == 0.5
+    result = table_in_gauge(MaterialTable({"a": before}, Gauge(rule="x")), 0.5)
+    assert result.materials == {"a": half} and result.gauge.rule == "x" and result.gauge.export_factor == 0.5
 
 
 def numbers(text: str) -> np.ndarray:
@@ -204,8 +204,8 @@ def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
         mesh = Mesh(square, faces, normals, np.array([1, 3], np.int16), open=True)
         write_glb(tmp_path / f"{name}.glb", mesh, ["bright", "unused", "metal"], CASES)
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
-    found = trimesh.load(tmp_path / "a.glb")
-    assert set(found.geometry) == {"bright", "metal"} and found.area == pytest.approx(1.0)
+    result = trimesh.load(tmp_path / "a.glb")
+    assert set(result.geometry) == {"bright", "metal"} and result.area == pytest.approx(1.0)
     tree = read_tree(tmp_path / "a.glb")
     assert tree["extensionsUsed"] == ["KHR_materials_specular"]
     for entry in tree["materials"]:
@@ -229,7 +229,7 @@ def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
     mesh, names = Mesh(vertices, faces, np.tile([0.0, 0, 1], (15, 1)), own), ["bright", "lambertian", "metal"]
     dark = np.full(5, 3, np.int16)
     write_glb(tmp_path / "a.glb", mesh, names, CASES, {"legs: lambertian": other, "all dark": dark})
-    tree, found = read_tree(tmp_path / "a.glb"), trimesh.load(tmp_path / "a.glb").geometry
+    tree, result = read_tree(tmp_path / "a.glb"), trimesh.load(tmp_path / "a.glb").geometry
     parts = read_part_materials(tmp_path / "a.glb")
     variants = tree["extensions"]["KHR_materials_variants"]["variants"]
     assert [each["name"] for each in variants] == ["legs: lambertian", "all dark"]
@@ -237,7 +237,7 @@ def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
     for k, labels in enumerate([own, other, dark]):
         variant = ["", "legs: lambertian", "all dark"][k]
         for face, label in enumerate(labels):
-            (holds,) = [n for n, part in found.items() if np.isclose(part.vertices, vertices[3 * face]).all(1).any()]
+            (holds,) = [n for n, part in result.items() if np.isclose(part.vertices, vertices[3 * face]).all(1).any()]
             assert parts[holds][variant] == names[label - 1]
     for each in tree["meshes"]:
         mappings = each["primitives"][0]["extensions"]["KHR_materials_variants"]["mappings"]
@@ -286,9 +286,9 @@ def hemisphere(no: float, count: int = 600) -> tuple[Angles, float]:
 
 def test_the_solved_model_is_the_operators():
     angles, _ = hemisphere(0.7, 40)
-    mine = distribution(GREY.alpha, angles.nh) * other_renderers.separable_smith(GREY.alpha, angles) * angles.ni
+    product = distribution(GREY.alpha, angles.nh) * other_renderers.separable_smith(GREY.alpha, angles) * angles.ni
     alpha, ni, no, nh = (torch.tensor(a, dtype=torch.float64) for a in (GREY.alpha, angles.ni, angles.no, angles.nh))
-    np.testing.assert_allclose(mine, specular(alpha, ni, no, nh), rtol=1e-9)
+    np.testing.assert_allclose(product, specular(alpha, ni, no, nh), rtol=1e-9)
     np.testing.assert_allclose(distribution(GREY.alpha, angles.nh), ggx(alpha, nh), rtol=1e-9)
     sky = Lobes(np.array([[0.0, 0.0, 1.0]]), np.array([1e-6]), np.ones((1, 3)))
     normal, view = (torch.tensor([v], dtype=torch.float64) for v in ([0.0, 0.0, 1.0], [np.sqrt(1 - 0.49), 0.0, 0.7]))

@@ -65,11 +65,11 @@ def test_scene_equals_resynthesis(exported, photo):
     pixels = whole_pixels(geometry["label"])
     reflector, materials = Reflector(Reference(tolerance=1e-3), light), [table[n] for n in made_export.NAMES]
     expected = resynthesise(reflector, materials, {"label": masks["label"] * pixels}, geometry)
-    found = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
-    error = block_means(found, pixels) / block_means(expected, pixels) - 1
+    result = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
+    error = block_means(result, pixels) / block_means(expected, pixels) - 1
     assert len(error) >= 15
     assert np.abs(error).max() < 0.01
-    assert not found[binary_erosion(geometry["label"] == 0, np.ones((3, 3)))].any()  # the light itself is not shown
+    assert not result[binary_erosion(geometry["label"] == 0, np.ones((3, 3)))].any()  # the light itself is not shown
 
 
 # one texel, one side ------------------------------------------------------------------------------------------------
@@ -83,10 +83,10 @@ MATT = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """With a mesh file of a ball."""
-    made = tmp_path_factory.mktemp("ball")
-    made_export.write_obj(made / "ball.obj", (1, 1, 1))
-    write_ply(made / "ball.red.ply", read_mesh(made / "ball.obj", ["red"], "red"))
-    return made
+    root = tmp_path_factory.mktemp("ball")
+    made_export.write_obj(root / "ball.obj", (1, 1, 1))
+    write_ply(root / "ball.red.ply", read_mesh(root / "ball.obj", ["red"], "red"))
+    return root
 
 
 def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
@@ -210,16 +210,16 @@ def test_files_are_quoted_matrices_written_for_rows_and_exposure_is_intensity_ti
 
 @pytest.mark.parametrize("material", [GLOSSY, METAL, LAMBERTIAN], ids=["glossy", "metal", "lambertian"])
 def test_shader_reflects_what_was_solved_at_normal_incidence(material):
-    found = shader_inputs(material)
-    assert (found["useSpecularWorkflow"] == 0) == (material is METAL)
-    if found["useSpecularWorkflow"]:
-        f0, diffuse = found["specularColor"], found["diffuseColor"] * (1 - found["specularColor"])
+    result = shader_inputs(material)
+    assert (result["useSpecularWorkflow"] == 0) == (material is METAL)
+    if result["useSpecularWorkflow"]:
+        f0, diffuse = result["specularColor"], result["diffuseColor"] * (1 - result["specularColor"])
     else:
-        f0, diffuse = found["diffuseColor"], np.zeros(3)
-        assert found["metallic"] == 1
+        f0, diffuse = result["diffuseColor"], np.zeros(3)
+        assert result["metallic"] == 1
     np.testing.assert_allclose(f0, material.specular)
     np.testing.assert_allclose(diffuse, material.diffuse)
-    assert found["roughness"] == (material.roughness if any(material.specular) else 1.0)
+    assert result["roughness"] == (material.roughness if any(material.specular) else 1.0)
 
 
 # as the USD library reads it -----------------------------------------------------------------------------------------
@@ -263,13 +263,13 @@ def test_vertices_stand_where_the_pose_puts_them(pxr, exported, photo):
     for label in mesh.labels:
         part = submesh(mesh, label)
         prim = stage.GetPrimAtPath(f"/scene/objects/chair/{made_export.NAMES[label - 1]}")
-        found, place = UsdGeom.Mesh(prim), world_of(prim)
-        points, normals = (np.array(attribute.Get()) for attribute in (found.GetPointsAttr(), found.GetNormalsAttr()))
+        result, place = UsdGeom.Mesh(prim), world_of(prim)
+        points, normals = (np.array(attribute.Get()) for attribute in (result.GetPointsAttr(), result.GetNormalsAttr()))
         expected = pose.apply(part.vertices) @ YUP_FROM_CAMERA
         np.testing.assert_allclose(points @ place[:3, :3].T + place[:3, 3], expected, atol=2e-6)
         np.testing.assert_allclose(normals, part.normals, atol=1e-6)
-        np.testing.assert_array_equal(np.array(found.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), part.faces)
-        assert set(found.GetFaceVertexCountsAttr().Get()) == {3} and found.GetNormalsInterpolation() == "vertex"
+        np.testing.assert_array_equal(np.array(result.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), part.faces)
+        assert set(result.GetFaceVertexCountsAttr().Get()) == {3} and result.GetNormalsInterpolation() == "vertex"
 
 
 @pytest.mark.parametrize("photo", PHOTOS)
@@ -280,7 +280,7 @@ def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
     dome = UsdLux.DomeLight(opened(exported, photo).GetPrimAtPath("/scene/light"))
     file = dome.GetTextureFileAttr().Get().resolvedPath
     assert dome.GetTextureFormatAttr().Get() == "latlong" and file
-    found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
+    result = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
     name, world = ("front", np.eye(3)) if photo == "front" else ("room", made_export.WORLD_FROM_CAMERA["side"])
     light = read_lobes(exported[1] / "lobes.parquet")[name].scale(made_export.EXPOSURES[photo][0]).rotate(world.T)
     directions = lat_long_directions(8, 16).reshape(-1, 3)[16:-16] @ YUP_FROM_CAMERA
@@ -288,7 +288,7 @@ def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
     rows, columns = (np.pi / 2 - np.arcsin(y)) / np.pi * ROWS, (np.pi - np.arctan2(x, z)) / (2 * np.pi) * 2 * ROWS
     expected = light.radiance(directions)
     assert expected.max() > 3 * np.median(expected)
-    texels = found[rows.astype(int), columns.astype(int)]
+    texels = result[rows.astype(int), columns.astype(int)]
     np.testing.assert_allclose(texels, expected, rtol=0.25, atol=0.01 * expected.max())
 
 
@@ -304,8 +304,8 @@ def blender_pictures(scenes: Path, photos: Sequence[str], samples: int) -> dict[
         command = [sys.executable, "-W", "ignore", "-c", code]
     elif command[0] is None:
         pytest.skip('Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH')
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr[-2000:]
     channels = {photo: read_exr(scenes / f"{photo}.blender.exr") for photo in photos}
     return {photo: np.stack([each[name] for name in "RGBA"], axis=-1) for photo, each in channels.items()}
 
@@ -314,11 +314,11 @@ def blender_pictures(scenes: Path, photos: Sequence[str], samples: int) -> dict[
 def test_round_trip_shows_what_mitsuba_shows(exported):
     inputs, out = exported
     photos, module = list(made_export.MESHES), mitsuba()
-    found = blender_pictures(out / "scenes", photos, 256)
+    result = blender_pictures(out / "scenes", photos, 256)
     for photo in photos:
         expected = np.array(module.render(module.load_file(str(out / "scenes" / f"{photo}.xml")), spp=512))
         mask = binary_erosion(read_exr(inputs["align"] / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
-        error = np.abs(found[photo][mask][:, :3] / expected[mask] - 1)
+        error = np.abs(result[photo][mask][:, :3] / expected[mask] - 1)
         print(f"{photo}: difference {np.median(error):.2%} (median), {np.percentile(error, 95):.2%} (95th percentile)")
         assert np.median(error) <= 0.03 and np.percentile(error, 95) <= 0.1
-        assert found[photo][mask][:, 3].min() == 1.0
+        assert result[photo][mask][:, 3].min() == 1.0

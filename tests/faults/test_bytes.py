@@ -232,7 +232,7 @@ WALLS = [[[0, 0, W, 0, W, H, 0, H]] * 400] * 400
 BAD_RUNS = [[10**30], [-5, 5, H * W], [], "o" * 2_000_000, "_" * 2_000_000 + "0", "P" * 50 + "0", "~", "é", 5]
 BAD_SHAPES = ["x", 5, [], [[]], [[1, 2, 3]], [["a"] * 6], [[0, 0, 1e300, 0, 0, 1]], {"size": [-1, -1], "counts": [1]}]
 BAD_SHAPES += [{"size": [10**9, 10**9], "counts": [10**18]}, *({"size": [H, W], "counts": runs} for runs in BAD_RUNS)]
-NO_PATH, OUTSIDE, NO_MODEL = "no path that can be followed", "outside the dataset", "not readable as a COLMAP model"
+NO_PATH, OUTSIDE, NO_MODEL = "not a path that can be followed", "outside the dataset", "not readable as a COLMAP model"
 URIS = dict.fromkeys(["circle", "circle/a.bin", "a\0b", "ü" * 200, "c/" * 3000], NO_PATH) | dict.fromkeys(
     ["../../a.bin", "out"], OUTSIDE
 )
@@ -353,14 +353,14 @@ REFUSED = {
     ("colmap", "model/cameras.bin"): [
         *((sample.cameras_bin(cameras=n), NO_MODEL) for n in (2, 2**40, 2**64 - 1)),
         (sample.cameras_bin(params=(300.0,)), NO_MODEL),
-        (sample.cameras_bin(model=77), "77 is no camera model"), (sample.cameras_bin(width=0), "is no camera"),
-        (sample.cameras_bin(params=(float("nan"), 104.0, 71.0)), "is no camera"),
-        *((sample.cameras_bin(params=params), "no photo's") for params in ((1e-300, 104.0, 71.0), (300.0, 1e9, 71.0))),
+        (sample.cameras_bin(model=77), "77 is not the number of a camera model"), (sample.cameras_bin(width=0), "is not a camera"),
+        (sample.cameras_bin(params=(float("nan"), 104.0, 71.0)), "is not a camera"),
+        *((sample.cameras_bin(params=params), "is implausible") for params in ((1e-300, 104.0, 71.0), (300.0, 1e9, 71.0))),
     ],
     ("colmap", "model/images.bin"): [
         *((sample.images_bin(images=n), NO_MODEL) for n in (2, 2**40, 2**64 - 1)),
         (sample.images_bin(points=2**63), NO_MODEL),
-        *((sample.images_bin(numbers=numbers), "is no pose") for numbers in ((0.0,) * 7, (*sample.POSE[:6], float("inf")))),
+        *((sample.images_bin(numbers=numbers), "is not a pose") for numbers in ((0.0,) * 7, (*sample.POSE[:6], float("inf")))),
         (sample.images_bin(camera_id=9), "has camera 9"),
     ],
     ("colmap text", "text/cameras.txt"): [
@@ -397,14 +397,14 @@ REFUSED = {
         (with_values(photo=np.full(5, -1)), "'photo' has an index without a name"),
         (with_values(exposures=(1.0, 2.0)), "exposure for each photo"), (rewritten("weight"), "0 columns 'weight'"),
         (rewritten("x", pa.array([HUGE] * 5)), "not readable"),
-        (rewritten("weight", pa.array([1.0, None, 1.0, 1.0, 1.0])), "'weight' has empty places"),
+        (rewritten("weight", pa.array([1.0, None, 1.0, 1.0, 1.0])), "'weight' has missing values"),
         (rewritten("weight", pa.array(["a"] * 5)), "of type string"),
         (rewritten("normal", pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(10)), 2)), "'normal' is of type"),
         (rewritten("normal", pa.array([[b"ab"] * 3] * 5, pa.list_(pa.binary(2), 3))), "'normal' is of type"),
         (rewritten("visibility", pa.array([b"x" * 10_000] * 5, pa.binary(10_000))), "'visibility' is of type"),
     ],
     ("lobes", "a.parquet"): [
-        (many_rows, "200,000,000 rows, more than 100,000,000"),
+        (many_rows, "200,000,000 rows; at most 100,000,000 are read"),
         (nameless_lobes, "an illumination that the metadata do not name"),
     ],
     ("yaml", "a.yaml"): [(text, "more than 2,000 values") for text in (LAUGHS, "[" + "a," * 100_000 + "]")],
@@ -772,7 +772,7 @@ def refused(folder, spec=DATASET, truth=TRUTH) -> InputError:
 
 # ── it reads nothing outside itself, and nothing that never ends ─────────────────────────────────────────────────────
 
-OUT, NOWHERE = "outside the dataset", "no path that can be followed"
+OUT, NOWHERE = "outside the dataset", "not a path that can be followed"
 WAYS = {
     "../secret{}": OUT, "m/../../secret{}": OUT, "{folder}/../secret{}": OUT, "link{}": OUT, "m/link{}": OUT, "twice{}": OUT,
     "up/secret{}": OUT, "circle/a{}": NOWHERE, "x\0y{}": NOWHERE, "é" * 200 + "{}": NOWHERE,

@@ -257,9 +257,9 @@ GONE = (".", "set", *(f"store/{name}" for name in ("trees", "keys", "views", "ca
 
 def test_a_folder_of_results_that_is_deleted_is_made_again(project):
     wanted = results(project)
-    for gone in (gone for gone in GONE if (project.build / gone).exists()):
-        shutil.rmtree(project.build / gone)
-        assert make(project) == 0 and is_sound(project) and results(project) == wanted, gone
+    for deleted in (deleted for deleted in GONE if (project.build / deleted).exists()):
+        shutil.rmtree(project.build / deleted)
+        assert make(project) == 0 and is_sound(project) and results(project) == wanted, deleted
 
 
 # ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -359,8 +359,8 @@ def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, agai
     usual = again(project)
     assert make(usual) == 0 and make(project, targets=["count"]) == 0
     before = set(stored(project).values())
-    code, said = end(start(project, without_rights=True, first=limited))
-    assert code == 1 and is_said(said, f"error: {stage}", "no file may become that large", "MB are free"), said
+    code, output = end(start(project, without_rights=True, first=limited))
+    assert code == 1 and is_said(output, f"error: {stage}", "no file may become that large", "MB are free"), output
     assert before <= set(stored(project).values()) and stage not in {
         s.partition("/")[0] for s in stored(project).values()
     }

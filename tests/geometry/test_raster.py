@@ -34,8 +34,8 @@ def test_inside_of_an_open_shell_is_marked_and_faces_the_viewer():
     bowl = ball()
     bowl.update_faces(bowl.triangles_center[:, 2] > 0)  # opening toward the camera at −z
     maps = rasterise(mesh_of([bowl]), CAMERA, STILL)
-    seen = maps.label > 0
-    assert maps.back[seen].mean() > 0.9 and maps.normal[seen][:, 2].max() < 0
+    visible = maps.label > 0
+    assert maps.back[visible].mean() > 0.9 and maps.normal[visible][:, 2].max() < 0
     assert not rasterise(mesh_of([ball()]), CAMERA, STILL).back.any()
 
 
@@ -81,8 +81,8 @@ def pixels(meshes, poses):
 
 def seen_by(meshes, poses, count=256):
     x, y, normal, thing = pixels(meshes, poses)
-    found = Occluders(meshes, poses).visibility_at(SQUARE, np.column_stack([x, y]), normal, count, 10_000)
-    return found and found.visibility, normal, thing
+    result = Occluders(meshes, poses).visibility_at(SQUARE, np.column_stack([x, y]), normal, count, 10_000)
+    return result and result.visibility, normal, thing
 
 
 def open_share(seen, normal):
@@ -108,7 +108,7 @@ def test_a_ball_over_a_floor_hides_its_form_factor():
     floor, radius, height = mesh_of([trimesh.creation.box(extents=(8, 8, 0.1))]), 0.5, 1.5
     facing = Pose(np.eye(3), np.array([0.0, 0.0, 6.05]))  # its upper side, z = 6, faces the camera
     centre = np.array([0.6, 0.0, 6 - height])
-    seen, normal, thing = seen_by([floor, mesh_of([ball(radius, 4)])], [facing, Pose(np.eye(3), centre)], count=2048)
+    visible, normal, thing = seen_by([floor, mesh_of([ball(radius, 4)])], [facing, Pose(np.eye(3), centre)], count=2048)
     x, y, *_ = pixels([floor, mesh_of([ball(radius, 4)])], [facing, Pose(np.eye(3), centre)])
     place = SQUARE.rays_through(np.column_stack([x, y]) + 0.5) * 6
     to_centre = centre - place
@@ -116,7 +116,7 @@ def test_a_ball_over_a_floor_hides_its_form_factor():
     expected = (radius / distance) ** 2 * height / distance
     on_floor = thing == 1
     assert expected[on_floor].max() > 0.09
-    np.testing.assert_allclose(1 - open_share(seen, normal)[on_floor], expected[on_floor], atol=0.008)
+    np.testing.assert_allclose(1 - open_share(visible, normal)[on_floor], expected[on_floor], atol=0.008)
 
 
 def test_codes_say_which_material_hides_a_direction_and_how_it_faces():

@@ -187,15 +187,17 @@ def test_a_dng_is_what_the_sensor_saw_by_whatever_name_however_bright_the_pictur
             ((below, right), (0.4, 0.3, 0.2)),
             ((above, left), (0.1,) * 3),
         ):
-            seen = photo.radiance[where].mean((0, 1))
-            np.testing.assert_allclose(seen, np.multiply(expected, brightness), rtol=0.02)
+            radiance = photo.radiance[where].mean((0, 1))
+            np.testing.assert_allclose(radiance, np.multiply(expected, brightness), rtol=0.02)
     assert photo.exposure == pytest.approx(200 / 50 / 4)
     assert photo.focal_px == pytest.approx(26 / np.hypot(36, 24) * np.hypot(W, H))
 
 
 def test_the_cameras_white_balance_is_applied(tmp_path):
-    seen = halves() * (0.5, 1.0, 0.8)  # the sensor sees less red and blue
-    lower = read_photo(write_dng(tmp_path / "a.dng", sensor_of(seen), neutral=(0.5, 1.0, 0.8))).radiance[H // 2 : -4]
+    radiance = halves() * (0.5, 1.0, 0.8)  # the sensor sees less red and blue
+    lower = read_photo(write_dng(tmp_path / "a.dng", sensor_of(radiance), neutral=(0.5, 1.0, 0.8))).radiance[
+        H // 2 : -4
+    ]
     grey, coloured = lower[:, 6 : W // 2 - 6].mean((0, 1)), lower[:, W // 2 + 6 : -4].mean((0, 1))
     np.testing.assert_allclose(grey / grey[1], 1, rtol=0.02)
     np.testing.assert_allclose(coloured / grey, (2, 1.5, 1), rtol=0.03)

@@ -52,23 +52,23 @@ def test_models_swapped_change_the_sign_and_the_order_of_lights_and_the_scale_of
     turned = (Losses(losses.values[::-1], losses.clusters[::-1]) for losses in (without, richer))
     assert compare_models(*turned, CLEARLY_FOR).margin == pytest.approx(one.margin, rel=1e-9)
     for which in ({0}, set(range(5))):
-        found = compare_models(scaled(without, which), scaled(richer, which), CLEARLY_FOR).margin
-        assert found == pytest.approx(one.margin, rel=0.01, abs=1e-3)
+        result = compare_models(scaled(without, which), scaled(richer, which), CLEARLY_FOR).margin
+        assert result == pytest.approx(one.margin, rel=0.01, abs=1e-3)
 
 
 @pytest.mark.parametrize("lights", [1, 3])
 def test_no_gain_is_no_evidence_either_way(lights):
     same, _ = made(0, lights)
-    found = compare_models(same, same, CLEARLY_FOR)
-    assert not found.accepted and found.margin == 0 and compare_models(same, same, CLEARLY_AGAINST).accepted
+    result = compare_models(same, same, CLEARLY_FOR)
+    assert not result.accepted and result.margin == 0 and compare_models(same, same, CLEARLY_AGAINST).accepted
 
 
 def test_nothing_held_out_decides_nothing():
     nothing, (one, better) = np.zeros(0), made(0, 1, gain=1.0)
     numbers = nothing.astype(int)
     for least in (CLEARLY_FOR, CLEARLY_AGAINST):
-        found = compare_models(Losses([nothing], [numbers]), Losses([nothing], [numbers]), least)
-        assert not found.accepted and found.margin is None and found.held_out_loss_with is None
+        result = compare_models(Losses([nothing], [numbers]), Losses([nothing], [numbers]), least)
+        assert not result.accepted and result.margin is None and result.held_out_loss_with is None
     both = [Losses([nothing, *of.values], [numbers, *of.clusters]) for of in (one, better)]
     assert compare_models(*both, CLEARLY_FOR).margin == pytest.approx(compare_models(one, better, CLEARLY_FOR).margin)
 
@@ -97,12 +97,12 @@ def test_each_light_counts_relative_to_itself():
     without, richer = [one, one, 100 * other], [one / 2, one / 2, 101 * other]
     assert sum(losses.sum() for losses in richer) > sum(losses.sum() for losses in without)
     numbers = [np.arange(len(v)) for v in without]
-    found = compare_models(Losses(without, numbers), Losses(richer, numbers), CLEARLY_FOR)
+    result = compare_models(Losses(without, numbers), Losses(richer, numbers), CLEARLY_FOR)
     assert (
-        found.accepted and not compare_models(Losses(richer, numbers), Losses(without, numbers), CLEARLY_FOR).accepted
+        result.accepted and not compare_models(Losses(richer, numbers), Losses(without, numbers), CLEARLY_FOR).accepted
     )
     logarithms = np.log([[1, 1, 200], [0.5, 0.5, 202]]) @ [0.25, 0.25, 0.5]  # by their counts
-    np.testing.assert_allclose([found.held_out_loss_without, found.held_out_loss_with], np.exp(logarithms), rtol=1e-3)
+    np.testing.assert_allclose([result.held_out_loss_without, result.held_out_loss_with], np.exp(logarithms), rtol=1e-3)
     exact, numbers = np.full(5, 1e-9), [np.arange(5)]
     noisy = exact * np.array([1.0, 2.0, 3.0, 1.0, 2.0])
     assert (
@@ -114,8 +114,8 @@ def test_each_light_counts_relative_to_itself():
 def test_losses_are_those_of_held_out_observations_or_of_all():
     problem, true = photographed(0, 2, cells=30, size=8)
     for some in (problem, problem.with_blocks([none_held_out(b) for b in problem.blocks])):
-        found = held_out_losses(some, Point(MATERIALS, true))
-        for values, clusters, block in zip(found.values, found.clusters, some.blocks, strict=True):
+        result = held_out_losses(some, Point(MATERIALS, true))
+        for values, clusters, block in zip(result.values, result.clusters, some.blocks, strict=True):
             assert len(values) == len(clusters) == (block.held_out.sum() or len(block))
     worse = msgspec.structs.replace(MATERIALS, diffuse=2 * MATERIALS.diffuse)
     richer, without = (held_out_losses(problem, Point(materials, true)) for materials in (MATERIALS, worse))

@@ -48,18 +48,18 @@ def solved():
 
 
 def test_materials_in_natural_lights(solved):
-    _, _, found = solved
-    factor = factor_between(found.point.materials, MATERIALS)
-    assert np.abs(found.point.materials.roughness - MATERIALS.roughness).max() < 0.1
-    whole = (found.point.materials.diffuse + found.point.materials.specular) * factor
+    _, _, result = solved
+    factor = factor_between(result.point.materials, MATERIALS)
+    assert np.abs(result.point.materials.roughness - MATERIALS.roughness).max() < 0.1
+    whole = (result.point.materials.diffuse + result.point.materials.specular) * factor
     assert np.abs(whole / (MATERIALS.diffuse + MATERIALS.specular) - 1).max() < 0.15
 
 
 def test_the_gauge_is_where_the_brightest_material_is_of_ordinary_brightness(solved):
     """Lights say nothing of it; without the determinant by the light it would run away."""
-    problem, _, found = solved
+    problem, _, result = solved
     bright = Materials(10 * START.diffuse, START.specular, START.roughness)
-    for one in (found, materials_in(problem, start=bright)):
+    for one in (result, materials_in(problem, start=bright)):
         reflectance = (one.point.materials.diffuse + one.point.materials.specular).mean(1)
         assert abs(np.log(reflectance.max() / MEDIAN_BRIGHTNESS)) < 2 * BRIGHTNESS_DEVIATION
 
@@ -67,15 +67,15 @@ def test_the_gauge_is_where_the_brightest_material_is_of_ordinary_brightness(sol
 def test_a_fit_lowers_its_value(solved):
     """Of materials and lights together, and of lights alone.  The prior on k_d is about the start, so the value of a fit that goes on is
     another, by little."""
-    problem, _, found = solved
-    again = fit_problem(problem, found, PRIOR, FitSchedule(descents=(0,), estimate_first=False)).value
-    given = fit_problem(problem, found, PRIOR, FitSchedule(materials_fixed=True)).value
-    assert again == pytest.approx(found.value, rel=1e-3) and np.isfinite(found.value)
+    problem, _, result = solved
+    again = fit_problem(problem, result, PRIOR, FitSchedule(descents=(0,), estimate_first=False)).value
+    value = fit_problem(problem, result, PRIOR, FitSchedule(materials_fixed=True)).value
+    assert again == pytest.approx(result.value, rel=1e-3) and np.isfinite(result.value)
     for step, before in (
         (FitSchedule(descents=(3,), estimate_first=False), again),
-        (FitSchedule(light_steps=3, materials_fixed=True), given),
+        (FitSchedule(light_steps=3, materials_fixed=True), value),
     ):
-        assert fit_problem(problem, found, PRIOR, step).value <= before + 1e-9 * abs(before)
+        assert fit_problem(problem, result, PRIOR, step).value <= before + 1e-9 * abs(before)
 
 
 def test_what_starts_nil_is_found_too():
@@ -83,8 +83,8 @@ def test_what_starts_nil_is_found_too():
     problem, _ = photographed(8, 2, size=12)
     nil = Materials(np.full((3, 3), 1e-5), np.full((3, 3), 0.1), np.full(3, 0.4))
     nil.diffuse[0] = 0.5
-    found = materials_in(problem, start=nil).point.materials
-    assert (found.diffuse[1] / found.diffuse[0] > 0.2 * MATERIALS.diffuse[1] / MATERIALS.diffuse[0]).all()
+    result = materials_in(problem, start=nil).point.materials
+    assert (result.diffuse[1] / result.diffuse[0] > 0.2 * MATERIALS.diffuse[1] / MATERIALS.diffuse[0]).all()
 
 
 # ── hyperparameters ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -104,10 +104,10 @@ def test_correlated_residuals_count_less():
 
 def test_the_contrast_of_a_light_is_found(solved):
     """Of one that has four times the variance the factor of the prior is larger."""
-    problem, true, found = solved
+    problem, true, result = solved
     more = [light.with_log_radiance(2 * light.log_radiance) for light in true]
     other = materials_in(spheres(more, size=16), schedule=FitSchedule(4, (8, 4, 4, 4)))
-    for one, larger in zip(found.hyperparameters, other.hyperparameters, strict=True):
+    for one, larger in zip(result.hyperparameters, other.hyperparameters, strict=True):
         assert 0.3 < one.factors[0] < 2.5 and larger.factors[0] > 1.5 * one.factors[0]
         assert FitSchedule().least_temperature <= one.temperature < 3  # noise is less than the noise model says
 
@@ -120,10 +120,12 @@ def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
     one = msgspec.structs.replace(one, precision=one.noise.precision(one.radiance, np.ones(len(one))))
     unsure = np.arange(len(one)) % 3 == 0
     rated = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
-    (kept,) = reliable_observations(JointProblem([rated], OPERATOR)).blocks
-    assert np.array_equal(kept.normal, one.normal[~unsure]) and np.array_equal(kept.radiance, one.radiance[~unsure])
+    (reliable,) = reliable_observations(JointProblem([rated], OPERATOR)).blocks
+    assert np.array_equal(reliable.normal, one.normal[~unsure]) and np.array_equal(
+        reliable.radiance, one.radiance[~unsure]
+    )
     noise = Noise(DARK_NOISE * one.noise.absolute, one.noise.relative)
-    assert kept.precision == pytest.approx(noise.precision(kept.radiance, np.ones(len(kept))))
+    assert reliable.precision == pytest.approx(noise.precision(reliable.radiance, np.ones(len(reliable))))
 
 
 # ── lights unlike most: a fit says what the photographs say, not what is usual ───────────────────────────────────────
@@ -181,11 +183,11 @@ def test_where_a_descent_ends_the_likelihood_has_no_slope_left():
     """Of (1) of the optimizer, in directions that matter: by far less than at the start."""
     problem, _ = photographed(5, 2, cells=40, size=10)
     start = begun(problem, 40)
-    found = fit_problem(problem, start, PRIOR, WHOLE)
+    result = fit_problem(problem, start, PRIOR, WHOLE)
     prior = MaterialPrior(start.point.materials, problem.blocks)
     descent = Descent(prior, problem.spread, lambda loss: None, np.ones(21, bool))
     sizes = []
-    for fit in (start, found):
+    for fit in (start, result):
         lights = fit.point.lights
         ones = [
             likelihood(
@@ -230,14 +232,14 @@ def paper_solved():
 
 
 def test_roughly_recovers_the_materials_and_the_radiance_it_was_rendered_with(paper_solved):
-    blocks, found = paper_solved[0], paper_solved[1].point
-    factor, rough = factor_between(found.materials, MATERIALS), found.materials.roughness
+    blocks, result = paper_solved[0], paper_solved[1].point
+    factor, rough = factor_between(result.materials, MATERIALS), result.materials.roughness
     np.testing.assert_allclose(rough[1:], MATERIALS.roughness[1:], atol=0.15)  # the first is all but Lambertian
     # the glossy one is split badly
-    np.testing.assert_allclose(found.materials.diffuse * factor, MATERIALS.diffuse, rtol=0.3, atol=0.05)
-    for data, radiance in zip(blocks, JointProblem(blocks, OPERATOR).radiance(found), strict=True):
+    np.testing.assert_allclose(result.materials.diffuse * factor, MATERIALS.diffuse, rtol=0.3, atol=0.05)
+    for data, radiance in zip(blocks, JointProblem(blocks, OPERATOR).radiance(result), strict=True):
         assert np.sqrt(np.mean((radiance - data.radiance) ** 2)) < 0.05 * np.quantile(data.radiance, 0.99)
-    for light in found.lights:
+    for light in result.lights:
         assert len(light) == BRIEF.lobes and (light.weight >= 0).all()
         assert np.isfinite(light.weight).all() and np.isfinite(light.sharpness).all()
         np.testing.assert_allclose(np.linalg.norm(light.axis, axis=1), 1)

@@ -129,8 +129,8 @@ def clipped(seed: int, share: float) -> Scene:
     limit = np.quantile(scene.observations.radiance, 1 - share)
     return in_two_rooms(
         seed,
-        radiance=lambda seen: np.minimum(seen.radiance, limit),
-        clipped=lambda seen: seen.radiance >= limit,
+        radiance=lambda data: np.minimum(data.radiance, limit),
+        clipped=lambda data: data.radiance >= limit,
     )
 
 
@@ -138,8 +138,8 @@ def with_wrong_normals(seed: int, degrees: float, share: float | None = None) ->
     """Normals turned toward random sides by |N(0, degrees)|, or a share of them by so many degrees."""
     rng = np.random.default_rng(99 + seed)
 
-    def turned(seen: Observations) -> np.ndarray:
-        normal = seen.normal
+    def turned(data: Observations) -> np.ndarray:
+        normal = data.normal
         side = rng.normal(size=normal.shape)
         side -= normal * np.sum(side * normal, axis=1, keepdims=True)
         side /= np.linalg.norm(side, axis=1, keepdims=True)
@@ -161,9 +161,9 @@ def with_invalid(seed: int) -> Scene:
 
     return in_two_rooms(
         seed,
-        radiance=lambda seen: spoilt(seen.radiance, (0, 0, np.nan), (1, 1, np.inf), (2, 2, -np.inf)),
-        normal=lambda seen: spoilt(seen.normal, (3, 0, np.nan)),
-        view=lambda seen: spoilt(seen.view, (4, slice(None), 0.0)),
+        radiance=lambda data: spoilt(data.radiance, (0, 0, np.nan), (1, 1, np.inf), (2, 2, -np.inf)),
+        normal=lambda data: spoilt(data.normal, (3, 0, np.nan)),
+        view=lambda data: spoilt(data.view, (4, slice(None), 0.0)),
     )
 
 
@@ -250,10 +250,10 @@ def solved(scene: Scene, choices: SolveOptions) -> tuple[JointProblem, Solution,
     )
     solution = solve(problem, start_from_photos(len(names)), choices)
     errors, _ = estimate_uncertainty(solution, problem, choices)
-    said = undetermined_by_observations(names, problem)
-    said += poorly_explained(problem, solution.effective_problem(problem).radiance(solution.point))
-    said += undetermined_by_answer(names, problem, solution.point.materials, errors.materials)
-    return problem, solution, said
+    sentences = undetermined_by_observations(names, problem)
+    sentences += poorly_explained(problem, solution.effective_problem(problem).radiance(solution.point))
+    sentences += undetermined_by_answer(names, problem, solution.point.materials, errors.materials)
+    return problem, solution, sentences
 
 
 def errors_of(scene: Scene, problem: JointProblem, solution: Solution) -> tuple[float, float, float]:
@@ -263,20 +263,20 @@ def errors_of(scene: Scene, problem: JointProblem, solution: Solution) -> tuple[
                  component.   Roughness: the largest error of observed materials that have a highlight
     Radiance     RMS error of the observations as they would be without noise and perturbation, each over its radiance plus their mean
     """
-    found, truth = solution.point.materials, scene.truth
-    parts, true = (np.stack([each.diffuse, each.specular]) for each in (found, truth))
+    result, truth = solution.point.materials, scene.truth
+    parts, true = (np.stack([each.diffuse, each.specular]) for each in (result, truth))
     linked = [list(each.materials) for each in connected_components(problem.blocks, len(truth)) if each.illuminations]
     off = []
     for own in linked:
         factor = true[:, own].sum((0, 1)) / parts[:, own].sum((0, 1))
         off.append(np.abs(parts[:, own] * factor - true[:, own]).mean() / true[:, own].sum(0).mean())
-    seen = np.isin(np.arange(len(truth)), np.concatenate(linked)) & (truth.specular.max(1) > 0)
-    roughness = np.abs(found.roughness - truth.roughness)[seen].max(initial=0.0)
+    data = np.isin(np.arange(len(truth)), np.concatenate(linked)) & (truth.specular.max(1) > 0)
+    roughness = np.abs(result.roughness - truth.roughness)[data].max(initial=0.0)
     relative = []
     blocks = zip(blocks_of_observations(scene.clean, Noise()), problem.blocks, solution.point.lights, strict=True)
     for clean, solved_block, light in blocks:
         ratio = solved_block.unit / clean.unit
-        predicted = ratio * Illumination(clean, light, found, OPERATOR).radiance()
+        predicted = ratio * Illumination(clean, light, result, OPERATOR).radiance()
         relative.append((predicted - clean.radiance) / (clean.radiance + 1))  # of which the mean is 1
     return max(off), float(roughness), float(np.sqrt(np.mean(np.square(np.concatenate(relative)))))
 
@@ -291,14 +291,14 @@ def marks(name: str) -> list[pytest.MarkDecorator]:
 def test_the_answer_is_within_its_bound_or_says_why_not(name):
     case = CASES[name]
     scene = case.scene(0)
-    problem, solution, said = solved(scene, case.choices)
+    problem, solution, sentences = solved(scene, case.choices)
     for part in (solution.point.materials, *solution.point.lights):
         assert all(np.isfinite(getattr(part, field)).all() for field in part.__struct_fields__)
     for error, bound in zip(errors_of(scene, problem, solution), case[1:4], strict=True):
         assert bound is None or error <= bound
-    assert all(any(words in sentence for sentence in said) for words in case.says) and bool(case.says) == bool(said), (
-        said
-    )
+    assert all(any(words in sentence for sentence in sentences) for words in case.says) and bool(case.says) == bool(
+        sentences
+    ), sentences
 
 
 # ── random starts ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -344,17 +344,17 @@ def materials_of_stage(folder, seen: Observations, **params):
 
 
 def test_observations_that_are_not_finite_are_counted_and_spoil_no_neighbour(tmp_path, caplog):
-    seen = with_invalid(0).observations
+    data = with_invalid(0).observations
     with caplog.at_level(logging.WARNING):
-        found = materials_of_stage(tmp_path / "harmed", seen, merge_degrees=20.0)
+        result = materials_of_stage(tmp_path / "harmed", data, merge_degrees=20.0)
     assert "observations are left out" in caplog.text
-    kept = np.isfinite(seen.radiance).all(1) & np.isfinite(seen.normal).all(1) & (seen.view != 0).any(1)
-    assert found == materials_of_stage(tmp_path / "whole", seen.take(kept), merge_degrees=20.0)
+    kept = np.isfinite(data.radiance).all(1) & np.isfinite(data.normal).all(1) & (data.view != 0).any(1)
+    assert result == materials_of_stage(tmp_path / "whole", data.take(kept), merge_degrees=20.0)
 
 
 def test_black_photos_are_named_or_refused_and_what_cannot_be_told_is_in_the_log(tmp_path, caplog):
-    seen = observed(TWO, rooms(0)).observations
-    dark = msgspec.structs.replace(seen, radiance=np.where(seen.photo[:, None] == 0, 0.0, seen.radiance))
+    data = observed(TWO, rooms(0)).observations
+    dark = msgspec.structs.replace(data, radiance=np.where(data.photo[:, None] == 0, 0.0, data.radiance))
     flat = observed(ONE, rooms(0, 1), normals=FLAT).observations
     with caplog.at_level(logging.WARNING):
         materials_of_stage(tmp_path / "one", dark)
@@ -365,7 +365,7 @@ def test_black_photos_are_named_or_refused_and_what_cannot_be_told_is_in_the_log
         "black",
         materials_of_stage,
         tmp_path / "all",
-        msgspec.structs.replace(seen, radiance=np.zeros_like(seen.radiance)),
+        msgspec.structs.replace(data, radiance=np.zeros_like(data.radiance)),
     )
 
 

@@ -50,11 +50,11 @@ def solved():
 
 
 def test_a_known_material_stays_and_gives_the_others_their_scale_and_colour(solved):
-    problem, found = solved
-    materials = found.point.materials
+    problem, result = solved
+    materials = result.point.materials
     np.testing.assert_allclose(materials.rows()[1], MATERIALS.rows()[1], rtol=1e-12)
     np.testing.assert_allclose(materials.diffuse, MATERIALS.diffuse, rtol=0.03)  # in absolute scale
-    in_place, moved = (fix_gauge(found.point, problem.blocks, known).materials for known in (CARD, KnownValues()))
+    in_place, moved = (fix_gauge(result.point, problem.blocks, known).materials for known in (CARD, KnownValues()))
     assert (in_place.vector() == materials.vector()).all() and (moved.diffuse != materials.diffuse).any()
 
 
@@ -84,10 +84,10 @@ def test_a_descent_with_known_unknowns_is_that_of_a_prior_that_holds_them(monkey
 
 def test_what_is_known_has_no_error_and_nothing_else_is_held_fixed(solved):
     """Without it the sum of each channel is fixed; where a light is known but for a factor, the sum over channels."""
-    problem, found = solved
-    errors = Posterior(problem, found, PRIOR).standard_errors().materials
+    problem, result = solved
+    errors = Posterior(problem, result, PRIOR).standard_errors().materials
     assert (errors.rows()[1] == 0).all() and (errors.rows()[[0, 2]] > 0).all()
-    light = msgspec.structs.replace(found.point.lights[0], fixed=np.ones(FEW, bool), scale_free=True)
+    light = msgspec.structs.replace(result.point.lights[0], fixed=np.ones(FEW, bool), scale_free=True)
     root = np.random.default_rng(0).normal(size=(21, 21))
     for known, fixed in (
         (CARD, [False, False]),
@@ -103,8 +103,10 @@ def test_a_known_reflectance_of_nil_stays_nil_and_nothing_is_expected_of_brightn
     problem, _ = solved
     known = KnownValues({1: np.array([0.2, 0.4, 0.25, 0, 0, 0, np.nan])})
     problem = msgspec.structs.replace(problem, known=known)
-    found = fit_problem(problem, initial_fit(insert_known(begun(problem).point, problem)), PRIOR, QUICK).point.materials
-    assert found.specular[1].max() <= LEAST_REFLECTANCE * (1 + 1e-9)
+    result = fit_problem(
+        problem, initial_fit(insert_known(begun(problem).point, problem)), PRIOR, QUICK
+    ).point.materials
+    assert result.specular[1].max() <= LEAST_REFLECTANCE * (1 + 1e-9)
     assert not MaterialPrior(MATERIALS, problem.blocks, known).members
     assert MaterialPrior(MATERIALS, problem.blocks).members
 
@@ -132,11 +134,11 @@ def known_but(light: Light, unit: float, held: np.ndarray, scale_free: bool) -> 
 def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_free):
     """Against finite differences along a step of its unknowns, of which known cells have at most their common factor."""
     problem, (true,) = photographed(5, 1, cells=30, size=10)
-    held, curves = true.axis[:, 2] < 0, {"log_tone": np.array([0.1])}
-    one = likelihood(problem, msgspec.structs.replace(true, fixed=held, scale_free=scale_free, **curves))
+    fixed, curves = true.axis[:, 2] < 0, {"log_tone": np.array([0.1])}
+    one = likelihood(problem, msgspec.structs.replace(true, fixed=fixed, scale_free=scale_free, **curves))
     system = one.normal_equations(materials_given=True)
     step = np.random.default_rng(0).normal(size=one.light.unknowns)
-    assert len(step) == 3 * (~held).sum() + 1 + scale_free == len(system.light_gradient)
+    assert len(step) == 3 * (~fixed).sum() + 1 + scale_free == len(system.light_gradient)
     lights = [step_light(one.light, s * step) for s in (1e-3, -1e-3)]
     ahead, behind = (one.with_point(light).normal_equations(materials_given=True).value for light in lights)
     assert (ahead - behind) / 4e-3 == pytest.approx(system.light_gradient @ step, rel=1e-3)
@@ -145,9 +147,9 @@ def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_f
     ahead, behind = (prior.with_point(light).normal_equations(materials_given=True).light_gradient for light in lights)
     hessian = prior.normal_equations(materials_given=True).light_hessian
     np.testing.assert_allclose((ahead - behind) / 2e-3, hessian @ step, rtol=1e-6, atol=1e-8)
-    free = np.tile(~held, 3)
+    free = np.tile(~fixed, 3)
     assert one.log_determinant == pytest.approx(np.linalg.slogdet(one.precision[np.ix_(free, free)])[1])
-    after = step_light(one.light, 1e-3 * step).weight[held] / true.weight[held]
+    after = step_light(one.light, 1e-3 * step).weight[fixed] / true.weight[fixed]
     assert np.ptp(after) < 1e-12 and (after[0, 0] != 1) == scale_free
 
 
@@ -155,34 +157,34 @@ def test_a_light_that_is_known_gives_materials_their_absolute_scale_and_one_up_t
     """Of the other light nothing is known; in the second, cells toward the viewer are not either."""
     problem, true = photographed(5, 2)
     tint = MATERIALS.diffuse / MATERIALS.diffuse.mean(1, keepdims=True)
-    for scale_free, held in ((False, np.ones(FEW, bool)), (True, true[0].axis[:, 2] > -0.8)):
-        light = known_but(true[0], problem.blocks[0].unit, held, scale_free)
+    for scale_free, fixed in ((False, np.ones(FEW, bool)), (True, true[0].axis[:, 2] > -0.8)):
+        light = known_but(true[0], problem.blocks[0].unit, fixed, scale_free)
         one = msgspec.structs.replace(problem, known=KnownValues(lights={"room0": light}))
         start = insert_known(begun(one).point, one)
         change = np.log(start.materials.diffuse / START.diffuse)
         assert (abs(change.mean()) < 1e-9) == scale_free and np.abs(change).max() > 0.01
-        found = fit_problem(one, initial_fit(start), PRIOR, WHOLE).point
-        answer = fix_gauge(found, one.blocks, one.known)
+        result = fit_problem(one, initial_fit(start), PRIOR, WHOLE).point
+        answer = fix_gauge(result, one.blocks, one.known)
         np.testing.assert_allclose(
             answer.materials.diffuse / answer.materials.diffuse.mean(1, keepdims=True), tint, rtol=0.05
         )
-        factor = found.lights[0].weight[held] / true[0].weight[held]
+        factor = result.lights[0].weight[fixed] / true[0].weight[fixed]
         assert np.ptp(factor) < 1e-9 * factor.mean()
         if scale_free:
             assert (answer.materials.diffuse + answer.materials.specular).max() == pytest.approx(BRIGHTEST)
-            assert (found.lights[0].weight[~held] != begun(one).point.lights[0].weight[~held]).all()
+            assert (result.lights[0].weight[~fixed] != begun(one).point.lights[0].weight[~fixed]).all()
         else:
-            assert factor[0, 0] == pytest.approx(1) and (answer.materials.vector() == found.materials.vector()).all()
+            assert factor[0, 0] == pytest.approx(1) and (answer.materials.vector() == result.materials.vector()).all()
             np.testing.assert_allclose(answer.materials.diffuse, MATERIALS.diffuse, rtol=0.05)
 
 
 def test_exposures_that_are_known_stay_and_have_no_unknowns():
     light = on_even_cells(drawn(3, 40), (0.0, 0.0))
     problem = msgspec.structs.replace(spheres([light], size=10), known=KnownValues(exposures=("room0",)))
-    found = fit_problem(
+    result = fit_problem(
         problem, initial_fit(insert_known(begun(problem, 40).point, problem)), PRIOR, QUICK
     ).point.lights[0]
-    assert (found.log_exposure == 0).all() and found.unknowns == 3 * 40
+    assert (result.log_exposure == 0).all() and result.unknowns == 3 * 40
     free = fit_problem(problem, begun(problem, 40), PRIOR, QUICK).point.lights[0]
     assert free.log_exposure[1] != 0 and free.unknowns == 3 * 40 + 1
 
@@ -196,8 +198,8 @@ def lamp(directions: np.ndarray) -> np.ndarray:
 def off_lamp(light: Light) -> float:
     """Degrees between the directions, on average, of what comes from within 15° of the lamp and should."""
     near = (everywhere := fibonacci_sphere(20000))[everywhere @ LAMP > np.cos(np.radians(15))]
-    shown = light.lobes.radiance(near)
-    one, other = (of.sum(1) @ near / np.linalg.norm(of.sum(1) @ near) for of in (shown, lamp(near)))
+    radiance = light.lobes.radiance(near)
+    one, other = (of.sum(1) @ near / np.linalg.norm(of.sum(1) @ near) for of in (radiance, lamp(near)))
     return float(np.degrees(np.arccos(one @ other)))
 
 
@@ -219,9 +221,9 @@ def test_what_a_mirror_ball_shows_is_the_light_but_behind_it_where_another_objec
     hidden = sphere[:, 0] > 0.9
     clipped, sees = np.tile(mirror[:, 1:2] > 0.9, 3), np.tile(np.where(hidden, 0, 255).astype(np.uint8), (len(view), 1))
     radiance, zero = 0.5 * lamp(mirror @ turn.T), np.zeros(len(view), int)
-    seen = observations_from_front(normals, radiance, zero, ("chrome",), clipped=clipped, visibility=sees)
-    seen.radiance[mirror[:, 0] > 0.88] = 1e3  # of the other object
-    light = light_from_ball(seen, np.full(3, 0.5), turn)
+    observed = observations_from_front(normals, radiance, zero, ("chrome",), clipped=clipped, visibility=sees)
+    observed.radiance[mirror[:, 0] > 0.88] = 1e3  # of the other object
+    light = light_from_ball(observed, np.full(3, 0.5), turn)
     out = {"behind": [0, 0, 1], "object": [1, 0, 0], "clipped": [0, 1, 0]}
     assert not any(light.fixed[np.argmax(light.axis @ turn @ axis)] for axis in out.values())
 
@@ -247,8 +249,8 @@ OPERATOR = reflection_operator("network")
 @pytest.fixture(scope="module")
 def fit():
     """The problem, the true lights, the fit, and the errors of its materials."""
-    problem, true, found = natural()
-    return problem, true, found, Posterior(problem, found, PRIOR).standard_errors()
+    problem, true, result = natural()
+    return problem, true, result, Posterior(problem, result, PRIOR).standard_errors()
 
 
 def test_materials_lie_within_a_few_standard_errors(fit):
@@ -260,10 +262,10 @@ def test_materials_lie_within_a_few_standard_errors(fit):
 
 def test_lights_lie_within_their_standard_errors(fit):
     """Log radiance of cells, after the factor per channel that is free: about 68 % within one posterior standard deviation."""
-    problem, true, found, _ = fit
+    problem, true, result, _ = fit
     made, within = [], []
-    posterior = Posterior(problem, found, PRIOR, lambda: made.append(1))
-    for system, light, true_light in zip(posterior.systems(with_scores=False), found.point.lights, true, strict=True):
+    posterior = Posterior(problem, result, PRIOR, lambda: made.append(1))
+    for system, light, true_light in zip(posterior.systems(with_scores=False), result.point.lights, true, strict=True):
         deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))[: (3 * len(light))]).reshape(3, -1)
         off = light.log_radiance - np.log(true_light.lobes.radiance(light.axis)).T
         within.append(np.abs(off - np.median(off, axis=1, keepdims=True)) < deviation)

@@ -148,11 +148,11 @@ def test_the_determinant_is_needed_for_roughness(seed):
     problem, true = photographed(seed, 1, cells=100, size=14, noise=1.0)
     block = none_held_out(problem.blocks[0].take(problem.blocks[0].material == 1))
     one = likelihood(JointProblem([block], OPERATOR), true[0], temperature=1.0)
-    tried, found = (0.15, 0.25, 0.4, 0.55), []
+    tried, result = (0.15, 0.25, 0.4, 0.55), []
     for roughness in tried:
         there = settled(one.with_point(materials=msgspec.structs.replace(MATERIALS, roughness=np.full(3, roughness))))
-        found.append((there.normal_equations().value, posterior(there)))
-    values, posteriors = np.array(found).T
+        result.append((there.normal_equations().value, posterior(there)))
+    values, posteriors = np.array(result).T
     assert tried[values.argmin()] == MATERIALS.roughness[1] and np.sort(values)[1] - values.min() > 10
     assert tried[posteriors.argmin()] < MATERIALS.roughness[1] and posteriors[2] - posteriors.min() > 10
 
@@ -174,8 +174,8 @@ def made(seed, photos=1, toned=False, hidden=False, bounced=False, clipped=False
     n = len(data)
     if hidden:
         turned = [fibonacci_sphere(96) @ np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(photos)]
-        seen = (255 * (rng.random((n, 96)) < 0.8)).astype(np.uint8)
-        data = msgspec.structs.replace(data, visibility=seen, directions=np.stack(turned))
+        visibility = (255 * (rng.random((n, 96)) < 0.8)).astype(np.uint8)
+        data = msgspec.structs.replace(data, visibility=visibility, directions=np.stack(turned))
     if bounced:
         data = msgspec.structs.replace(data, bounced=rng.random((n, 6)) * (rng.random((n, 1)) < 0.5))
     if near:
@@ -305,8 +305,8 @@ def test_the_density_is_one_altogether():
 
 @pytest.mark.parametrize("material, name", [(PLASTIC, "dielectric"), (GOLD, "metal"), (FELT, "fabric")])
 def test_materials_are_of_the_class_that_they_look_like(material, name):
-    found, probability = likeliest_class(np.array(material[0]), material[1], 0.05, 0.02)
-    assert found == name and probability > 0.8
+    result, probability = likeliest_class(np.array(material[0]), material[1], 0.05, 0.02)
+    assert result == name and probability > 0.8
 
 
 def test_gloss_ten_times_too_strong_at_roughness_1_is_not_expected():

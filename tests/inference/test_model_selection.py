@@ -57,17 +57,19 @@ def shaded():
 
 def lit_bowls(name, seed) -> Observations:
     """A bowl and a ball of each material, all bounces within a bowl as (1) has them: the fixed point of what it sends itself."""
-    seen, normals, d = bowls(name, rough_light(seed), size=12, count=256), sphere_normals(12), fibonacci_sphere(256)
+    observed, normals, d = bowls(name, rough_light(seed), size=12, count=256), sphere_normals(12), fibonacci_sphere(256)
     exits = -normals[:, None] + 2 * (normals @ d.T)[..., None] * d
     facing = occluder_codes(np.zeros(exits.shape[0] * 256, int), -exits.reshape(-1, 3)).reshape(-1, 256)
-    met = np.vstack([facing + 64 * (k // 2) for k in range(6)])
-    seen = msgspec.structs.replace(seen, occluder=np.where(seen.visibility == 0, met, NO_OCCLUDER).astype(np.uint16))
-    shown = seen.radiance
+    codes = np.vstack([facing + 64 * (k // 2) for k in range(6)])
+    observed = msgspec.structs.replace(
+        observed, occluder=np.where(observed.visibility == 0, codes, NO_OCCLUDER).astype(np.uint16)
+    )
+    radiance = observed.radiance
     for _ in range(8):
-        sent = bounced_light(seen, shown)
-        kd, ks = MATERIALS.diffuse[seen.material], MATERIALS.specular[seen.material]
-        shown = seen.radiance + kd * sent[:, :3] + ks * sent[:, 3:]
-    return msgspec.structs.replace(seen, radiance=shown)
+        bounced = bounced_light(observed, radiance)
+        kd, ks = MATERIALS.diffuse[observed.material], MATERIALS.specular[observed.material]
+        radiance = observed.radiance + kd * bounced[:, :3] + ks * bounced[:, 3:]
+    return msgspec.structs.replace(observed, radiance=radiance)
 
 
 @cache
@@ -77,16 +79,16 @@ def lit_rooms(seed: int) -> list[Observations]:
 
 @pytest.fixture(scope="module")
 def lit():
-    return [blocks_of_observations(seen, Noise(0.02, 0.02))[0] for seen in lit_rooms(20)]
+    return [blocks_of_observations(observed, Noise(0.02, 0.02))[0] for observed in lit_rooms(20)]
 
 
 def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(shaded):
     error = {}
     for choice in ("off", "auto"):
         solution = solved(shaded, OF_SHAPES, self_shadowing=choice)
-        found = solution.point.materials
-        factor = factor_between(found, MATERIALS)
-        off = found.diffuse * factor / MATERIALS.diffuse - 1, found.roughness - MATERIALS.roughness
+        result = solution.point.materials
+        factor = factor_between(result, MATERIALS)
+        off = result.diffuse * factor / MATERIALS.diffuse - 1, result.roughness - MATERIALS.roughness
         error[choice] = [np.abs(each).mean() for each in off]
     assert solution.shadows.accepted and solution.shadows.margin > CLEARLY_FOR
     assert solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
@@ -118,7 +120,7 @@ def hull(seen: Observations) -> Observations:
 
 
 def test_bounces_of_a_hull_without_hollows_do_not_darken_the_materials():
-    blocks = [blocks_of_observations(hull(seen), Noise(0.02, 0.02))[0] for seen in lit_rooms(20)]
+    blocks = [blocks_of_observations(hull(observed), Noise(0.02, 0.02))[0] for observed in lit_rooms(20)]
     solution = solved(blocks, OF_SHAPES)
     assert not solution.interreflection.accepted, solution.interreflection
     assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
@@ -134,8 +136,8 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
 
     wrong = hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5))
     few = {"cells": 24, "observations": 150, "tone": "off"}
-    found = solved(wrong, **few)
-    assert not found.shadows.accepted and found.shadows.margin < CLEARLY_AGAINST
+    result = solved(wrong, **few)
+    assert not result.shadows.accepted and result.shadows.margin < CLEARLY_AGAINST
     assert solved(wrong, **few, self_shadowing="on").shadows.accepted
     assert solved(hiding(lambda b: np.full((len(b), 96), 255)), **few).shadows.accepted
 
@@ -152,8 +154,8 @@ def rooms(photos=1, size=12):
 
 def through(data, *exponents):
     """What cameras with tone curves make of it, one exponent a photo."""
-    shown = curve(data.radiance, np.array(exponents)[data.photo][:, None])
-    return msgspec.structs.replace(data, radiance=shown, precision=1 / np.hypot(0.05, 0.05 * shown))
+    radiance = curve(data.radiance, np.array(exponents)[data.photo][:, None])
+    return msgspec.structs.replace(data, radiance=radiance, precision=1 / np.hypot(0.05, 0.05 * radiance))
 
 
 def exponents_of(solution):
@@ -161,8 +163,8 @@ def exponents_of(solution):
 
 
 def error_of(solution):
-    found = solution.point.materials
-    return np.abs(found.diffuse * factor_between(found, MATERIALS) - MATERIALS.diffuse).max()
+    result = solution.point.materials
+    return np.abs(result.diffuse * factor_between(result, MATERIALS) - MATERIALS.diffuse).max()
 
 
 @pytest.fixture(scope="module")
@@ -171,16 +173,16 @@ def curved():
 
 
 def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
-    found, without = (solved(curved, MANY, tone=tone) for tone in ("auto", "off"))
-    exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)]
+    result, without = (solved(curved, MANY, tone=tone) for tone in ("auto", "off"))
+    exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(result)]
     off = np.log(exponents) - np.log((1.3, 0.8, 1.0))
     assert (
         np.ptp(off) < 0.02 and abs(off.mean()) < 0.08
     )  # what all photos share, a light of more contrast nearly explains
     assert all(len(e) == 0 for e in exponents_of(without))
-    assert error_of(found) < 0.4 * error_of(without), (error_of(found), error_of(without))
-    assert [one.accepted for one in found.tone][:2] == [True, True]
-    for one in found.tone:
+    assert error_of(result) < 0.4 * error_of(without), (error_of(result), error_of(without))
+    assert [one.accepted for one in result.tone][:2] == [True, True]
+    for one in result.tone:
         assert one.accepted == (
             one.margin > CLEARLY_FOR and one.held_out_loss_without > (1 + LEAST_TONE_GAIN) * one.held_out_loss_with
         )
@@ -202,8 +204,8 @@ def test_a_curve_that_no_camera_has_is_not_believed():
 
 def test_an_exponent_near_its_bounds_is_named():
     point = Point(MATERIALS, [on_even_cells(np.zeros((3, 30)), log_tone=np.log([g])) for g in (1.2, 1.65)])
-    (said,) = unlikely_curves(JointProblem(rooms()[:2], OPERATOR), point)
-    assert "room1" in said and "1.6" in said
+    (sentences,) = unlikely_curves(JointProblem(rooms()[:2], OPERATOR), point)
+    assert "room1" in sentences and "1.6" in sentences
 
 
 # ── what is compared, and from where ─────────────────────────────────────────────────────────────────────────────────
@@ -211,15 +213,15 @@ def test_an_exponent_near_its_bounds_is_named():
 
 def test_without_held_out_observations_shadows_stay_and_tone_curves_are_not_tried(lit):
     """They would be judged by the observations that they were fitted to; marginal likelihoods need none."""
-    found = solved([none_held_out(block) for block in lit], QUICK, cells=24, observations=100)
-    assert found.shadows.accepted and found.shadows.margin is None
-    assert found.interreflection.log_bayes_factor is not None
-    assert not any(one.accepted for one in found.tone) and found.splitting == []
+    result = solved([none_held_out(block) for block in lit], QUICK, cells=24, observations=100)
+    assert result.shadows.accepted and result.shadows.margin is None
+    assert result.interreflection.log_bayes_factor is not None
+    assert not any(one.accepted for one in result.tone) and result.splitting == []
 
 
 def test_without_interreflection_the_gauge_is_fixed_though_surfaces_light_each_other(lit):
-    found = solved(lit, QUICK, cells=24, observations=100, interreflection="off")
-    assert (found.point.materials.diffuse + found.point.materials.specular).max() == pytest.approx(BRIGHTEST)
+    result = solved(lit, QUICK, cells=24, observations=100, interreflection="off")
+    assert (result.point.materials.diffuse + result.point.materials.specular).max() == pytest.approx(BRIGHTEST)
 
 
 def test_one_cluster_is_no_evidence():
@@ -257,12 +259,12 @@ def photographed_at(*curvatures):
 
 def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     blocks = photographed_at(0.2, 0.0, 0.2)
-    found, far = (solved(blocks, MANY, tone="off", distance=distance) for distance in ("auto", "off"))
-    assert [one.accepted for one in found.distances] == [True, False, True]
-    assert [light.curvature for light in found.point.lights] == [0.2, 0, 0.2]
-    assert all(one.accepted == (one.log_bayes_factor > VERY_STRONG) for one in found.distances)
+    result, far = (solved(blocks, MANY, tone="off", distance=distance) for distance in ("auto", "off"))
+    assert [one.accepted for one in result.distances] == [True, False, True]
+    assert [light.curvature for light in result.point.lights] == [0.2, 0, 0.2]
+    assert all(one.accepted == (one.log_bayes_factor > VERY_STRONG) for one in result.distances)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
-    assert error_of(found) < 0.5 * error_of(far), (error_of(found), error_of(far))
+    assert error_of(result) < 0.5 * error_of(far), (error_of(result), error_of(far))
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():

@@ -62,10 +62,10 @@ def test_a_clipped_channel_pulls_only_from_below(clipped):
 
 
 def test_places_turn_into_the_frame_of_the_light_as_normals_do():
-    seen, turn = bowls("room", rough_light(20)), np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    seen = msgspec.structs.replace(seen, place=2 * seen.normal)
-    (data,) = blocks_of_observations(seen, Noise(), world_from_camera={seen.photos[0]: turn})
-    (camera,) = blocks_of_observations(seen, Noise())
+    observed, turn = bowls("room", rough_light(20)), np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    observed = msgspec.structs.replace(observed, place=2 * observed.normal)
+    (data,) = blocks_of_observations(observed, Noise(), world_from_camera={observed.photos[0]: turn})
+    (camera,) = blocks_of_observations(observed, Noise())
     np.testing.assert_allclose(data.place, camera.place @ turn.T, atol=1e-6)
     np.testing.assert_allclose(data.place, 2 * data.normal, atol=1e-6)
 
@@ -77,7 +77,7 @@ def test_model_in_shadow_is_the_radiance_traced_in_bowls_by_brute_force(seed):
     light = rough_light(seed)
     light = msgspec.structs.replace(light, weight=light.weight / data.unit)
     both = (Illumination(b, light, MATERIALS, NETWORK).radiance() for b in (data, data.with_effects(False, False)))
-    error, ignored = (np.sqrt(np.mean((found - data.radiance) ** 2)) for found in both)
+    error, ignored = (np.sqrt(np.mean((result - data.radiance) ** 2)) for result in both)
     assert ignored > 0.15 * data.radiance.mean() and error < 0.2 * ignored
 
 
@@ -100,8 +100,8 @@ def test_the_gauge_changes_no_radiance_and_a_shifted_point_comes_to_the_same_one
     settled = [fix_gauge(p, problem.blocks) for p in (point, shifted)]
     np.testing.assert_allclose(settled[0].materials.vector(), settled[1].materials.vector(), rtol=1e-12)
     for at in (*settled, shifted):
-        for found, expected in zip(problem.radiance(at), problem.radiance(point), strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-12)
+        for result, expected in zip(problem.radiance(at), problem.radiance(point), strict=True):
+            np.testing.assert_allclose(result, expected, rtol=1e-12)
 
 
 def test_a_single_light_comes_out_grey_and_a_lobe_made_sharper_at_its_energy_moves_no_tint():
@@ -140,13 +140,17 @@ def test_a_sample_has_of_every_material_and_region_of_the_light_its_share():
 
 
 @pytest.fixture(scope="module", params=["linear", "toned"])
-def given(request):
+def illumination(request):
     return photos_in_a_wrong_light("bounced", request.param == "toned")
 
 
-def test_bounces_add_a_known_radiance(given):
-    light = msgspec.structs.replace(given.light, log_tone=np.zeros(0))
-    data, kd, ks = given.block, MATERIALS.diffuse[given.block.material], MATERIALS.specular[given.block.material]
+def test_bounces_add_a_known_radiance(illumination):
+    light = msgspec.structs.replace(illumination.light, log_tone=np.zeros(0))
+    data, kd, ks = (
+        illumination.block,
+        MATERIALS.diffuse[illumination.block.material],
+        MATERIALS.specular[illumination.block.material],
+    )
     with_, without = (
         Illumination(b, light, MATERIALS, OPERATOR).radiance() for b in (data, data.with_effects(True, False))
     )
@@ -176,29 +180,31 @@ def bowl(albedo, depth=0.5, size=40, count=1024) -> Observations:
 @pytest.mark.parametrize(("albedo", "depth"), [(0.3, 0.5), (0.9, 0.5), (0.9, 0.9)])
 def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
     """k_d (V̄ · 1 + G) is L, all bounces with it, with V̄ and G from directions that are hidden."""
-    seen = bowl(albedo, depth)
-    sent = bounced_light(seen, seen.radiance)[:, :3]
-    cosine = np.maximum(seen.normal @ fibonacci_sphere(1024).T, 0)
-    open_share = (cosine * (seen.visibility / 255)).sum(1) / cosine.sum(1)
-    np.testing.assert_allclose(albedo * (open_share[:, None] + sent), seen.radiance, rtol=0.03)
+    observed = bowl(albedo, depth)
+    bounced = bounced_light(observed, observed.radiance)[:, :3]
+    cosine = np.maximum(observed.normal @ fibonacci_sphere(1024).T, 0)
+    open_share = (cosine * (observed.visibility / 255)).sum(1) / cosine.sum(1)
+    np.testing.assert_allclose(albedo * (open_share[:, None] + bounced), observed.radiance, rtol=0.03)
 
 
 def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own_unit_alike():
-    seen, factor = bowl(0.5, size=20, count=256), 1e4
-    open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
-    for none in (open_, msgspec.structs.replace(seen, occluder=None)):
+    observed, factor = bowl(0.5, size=20, count=256), 1e4
+    open_ = msgspec.structs.replace(observed, visibility=np.full_like(observed.visibility, 255))
+    for none in (open_, msgspec.structs.replace(observed, occluder=None)):
         assert blocks_of_observations(none, Noise())[0].bounced is None
-    brighter = msgspec.structs.replace(seen, radiance=factor * seen.radiance)
-    sent, more = (bounced_light(photo, photo.radiance) for photo in (seen, brighter))
-    np.testing.assert_allclose(more, factor * sent, rtol=1e-5)
-    one, other = (blocks_of_observations(photo, Noise())[0].bounced for photo in (seen, brighter))
+    brighter = msgspec.structs.replace(observed, radiance=factor * observed.radiance)
+    bounced, more = (bounced_light(photo, photo.radiance) for photo in (observed, brighter))
+    np.testing.assert_allclose(more, factor * bounced, rtol=1e-5)
+    one, other = (blocks_of_observations(photo, Noise())[0].bounced for photo in (observed, brighter))
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
-def test_what_interreflection_determines_the_gauge_leaves(given):
-    point = Point(MATERIALS, [given.light])
-    np.testing.assert_array_equal(fix_gauge(point, [given.block]).materials.diffuse, MATERIALS.diffuse)
-    assert (fix_gauge(point, [given.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse).any()
+def test_what_interreflection_determines_the_gauge_leaves(illumination):
+    point = Point(MATERIALS, [illumination.light])
+    np.testing.assert_array_equal(fix_gauge(point, [illumination.block]).materials.diffuse, MATERIALS.diffuse)
+    assert (
+        fix_gauge(point, [illumination.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse
+    ).any()
 
 
 # ── Lights on cells: what equal ones show, and what splitting keeps ─────────────────────────────────────────────────

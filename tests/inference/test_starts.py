@@ -83,10 +83,10 @@ def check_same_but_for_the_gauge(found: Materials, true=MATERIALS):
 def test_what_is_known_is_taken_over_whatever_the_order_and_the_units():
     blocks, lights = truth(0, 1)
     turned = [msgspec.structs.replace(b, unit=7 * b.unit, radiance=b.radiance / 7) for b in reversed(blocks)]
-    materials, found = start_from(written(blocks, MATERIALS, lights), turned)
+    materials, result = start_from(written(blocks, MATERIALS, lights), turned)
     check_same_but_for_the_gauge(materials)
-    explained(turned, materials, found)
-    for light, before in zip(found, reversed(lights), strict=True):
+    explained(turned, materials, result)
+    for light, before in zip(result, reversed(lights), strict=True):
         np.testing.assert_allclose(light.axis, before.axis, atol=1e-12)
 
 
@@ -97,30 +97,30 @@ def test_cells_that_split_stay_as_small_as_they_are():
         light = light.split(np.arange(len(light)) >= len(light) - 2)
     assert light.sharpness.max() > 10_000
     shown = msgspec.structs.replace(block, radiance=Illumination(block, light, MATERIALS, OPERATOR).radiance())
-    _, (found,) = start_from(written([shown], MATERIALS, [light]), [shown])
-    np.testing.assert_allclose(found.sharpness, light.sharpness, rtol=1e-12)
+    _, (result,) = start_from(written([shown], MATERIALS, [light]), [shown])
+    np.testing.assert_allclose(result.sharpness, light.sharpness, rtol=1e-12)
 
 
 def test_a_light_nobody_knows_is_constant_and_the_known_ones_stay():
     blocks, lights = truth(0, 1)
-    materials, found = start_from(written(blocks[:1], MATERIALS, lights[:1]), blocks)
+    materials, result = start_from(written(blocks[:1], MATERIALS, lights[:1]), blocks)
     check_same_but_for_the_gauge(materials)
-    explained(blocks[:1], materials, found[:1])
-    assert np.ptp(found[1].log_radiance, axis=1).max() < 1e-9 and len(found[1]) == CELLS
-    mean = Illumination(blocks[1], found[1], materials, OPERATOR).radiance().mean()
+    explained(blocks[:1], materials, result[:1])
+    assert np.ptp(result[1].log_radiance, axis=1).max() < 1e-9 and len(result[1]) == CELLS
+    mean = Illumination(blocks[1], result[1], materials, OPERATOR).radiance().mean()
     assert abs(np.log(mean)) < 0.5  # a block's is 1
 
 
 def test_a_material_nobody_knows_stands_beside_the_known_ones():
     """Its reflectance is as its mean radiance says, on the scale of the others."""
     blocks, lights = truth(0, 1)
-    materials, found = start_from(written(blocks, first(MATERIALS, 2), lights, NAMES[:2], (0, 0)), blocks)
+    materials, result = start_from(written(blocks, first(MATERIALS, 2), lights, NAMES[:2], (0, 0)), blocks)
     whole, true = (m.diffuse + m.specular for m in (materials, MATERIALS))
     check_same_but_for_the_gauge(first(materials, 2), first(MATERIALS, 2))
     ratio = (whole[2] / whole[:2].mean(0)) / (true[2] / true[:2].mean(0))
     assert (np.abs(np.log(ratio)) < np.log(2)).all()
     known = [b.take(b.material < 2) for b in blocks]
-    explained(known, materials, found)
+    explained(known, materials, result)
 
 
 def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
@@ -140,10 +140,10 @@ def test_a_light_that_is_no_longer_so_starts_anew_and_is_named(caplog):
     blocks, lights = truth(0, 1)
     turned = [msgspec.structs.replace(lights[0], axis=-lights[0].axis, weight=lights[0].weight ** 2), lights[1]]
     with caplog.at_level(logging.WARNING):
-        materials, found = start_from(written(blocks, MATERIALS, turned), blocks)
+        materials, result = start_from(written(blocks, MATERIALS, turned), blocks)
     assert "'room0' starts anew" in caplog.text and "room1" not in caplog.text
-    assert np.ptp(found[0].log_radiance, axis=1).max() < 1e-9
-    explained(blocks[1:], materials, found[1:])
+    assert np.ptp(result[0].log_radiance, axis=1).max() < 1e-9
+    explained(blocks[1:], materials, result[1:])
 
 
 def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
@@ -162,9 +162,9 @@ def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kep
     chosen = {"self_shadowing_chosen_by": losses, "interreflection_chosen_by": losses}
     model = Model(self_shadowing=kept, interreflection=not kept, **chosen)
     earlier = EarlierSolution(MaterialTable({}, Gauge(), model), {}, {})
-    found, names = with_earlier_decisions(SolveOptions(), earlier), ["off", "on"]
+    result, names = with_earlier_decisions(SolveOptions(), earlier), ["off", "on"]
     expected = [names[kept], names[not kept]] if tried else ["auto", "auto"]
-    assert [found.self_shadowing, found.interreflection] == expected
+    assert [result.self_shadowing, result.interreflection] == expected
     asked = SolveOptions(self_shadowing="off", interreflection="on")
     assert with_earlier_decisions(asked, earlier) == asked
 
@@ -177,12 +177,12 @@ def test_a_solve_goes_on_from_the_fit_that_surface_wrote_in_whatever_unit_a_bloc
     written = msgspec.json.decode(msgspec.json.encode(InitialFit.from_fit(fit, problem.blocks)), type=InitialFit)
     block = problem.blocks[0]
     brighter = msgspec.structs.replace(block, unit=4 * block.unit)
-    (found,) = start_from_surface(written)(problem.with_blocks([brighter, *problem.blocks[1:]]), FEW)
-    assert (found.hyperparameters, found.value) == (fit.hyperparameters, fit.value)
-    for light, before, factor in zip(found.point.lights, fit.point.lights, (4, 1, 1), strict=True):
+    (result,) = start_from_surface(written)(problem.with_blocks([brighter, *problem.blocks[1:]]), FEW)
+    assert (result.hyperparameters, result.value) == (fit.hyperparameters, fit.value)
+    for light, before, factor in zip(result.point.lights, fit.point.lights, (4, 1, 1), strict=True):
         np.testing.assert_allclose(light.weight * factor, before.weight, rtol=1e-12)
         np.testing.assert_array_equal(light.axis, before.axis)
-    np.testing.assert_array_equal(found.point.materials.rows(), fit.point.materials.rows())
+    np.testing.assert_array_equal(result.point.materials.rows(), fit.point.materials.rows())
 
 
 def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
@@ -226,9 +226,9 @@ def blocks():
     """Two lights with two photos each, some of which is hidden, and some sent by other surfaces, as is made up."""
     rng, directions = np.random.default_rng(4), np.stack([fibonacci_sphere(96)] * 2)
     lights = [random_light(rng, 2, photos=2) for _ in range(2)]
-    made = [sphere_block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size=6) for i, li in enumerate(lights)]
-    seen = [(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8) for b in made]
-    hidden = [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, seen)]
+    lit = [sphere_block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size=6) for i, li in enumerate(lights)]
+    visibilities = [(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8) for b in lit]
+    hidden = [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(lit, visibilities)]
     bounced = [msgspec.structs.replace(b, bounced=0.01 * rng.random((len(b), 6))) for b in hidden]
     return [msgspec.structs.replace(b, place=rng.normal(size=(len(b), 3))) for b in bounced]
 
@@ -238,18 +238,18 @@ def answer_bytes(blocks, checkpoint=Checkpoint(None), spread=serial_map):
     events = []
 
     parts = FitRunner(checkpoint, events.append)
-    found = solve(JointProblem(blocks, OPERATOR, spread=spread), start_from_photos(3), CHOICES, parts)
-    p = found.point
+    result = solve(JointProblem(blocks, OPERATOR, spread=spread), start_from_photos(3), CHOICES, parts)
+    p = result.point
     parts = [p.materials.vector(), *(np.ravel(getattr(li, f)) for li in p.lights for f in li.__struct_fields__)]
     decided = [
-        found.history,
-        found.shadows,
-        found.interreflection,
-        found.tone,
-        found.distances,
-        found.splitting,
+        result.history,
+        result.shadows,
+        result.interreflection,
+        result.tone,
+        result.distances,
+        result.splitting,
     ]
-    hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.fit)]
+    hyper = [[one.value, one.hyperparameters] for one in (result.materials, result.fit)]
     return np.concatenate(parts).tobytes() + msgspec.json.encode([decided, hyper]), events
 
 
@@ -283,9 +283,9 @@ def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp
 
 def test_every_part_reports_what_it_does(whole):
     _, events = whole
-    seen = [event.phase for event in events]
-    assert set(seen) <= set(ALL) and set(ALL) - {"shadows and bounces", "suns"} <= set(seen)
-    assert sorted(seen, key=ALL.index) == seen and all(np.isfinite(event.loss) for event in events)
+    visibilities = [event.phase for event in events]
+    assert set(visibilities) <= set(ALL) and set(ALL) - {"shadows and bounces", "suns"} <= set(visibilities)
+    assert sorted(visibilities, key=ALL.index) == visibilities and all(np.isfinite(event.loss) for event in events)
     assert [event.round for event in events] == sorted(event.round for event in events)
 
 
@@ -307,11 +307,11 @@ def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_t
 
 def test_progress_never_goes_back_moves_with_every_point_and_is_whole_only_at_the_end():
     """With three starts each model is fitted three times: the first phases are entered anew."""
-    said, effects, later = [], list(PHASES)[:3], [*list(PHASES)[3:], "splitting 1", "splitting 2", "lights", "suns"]
-    report = solve_progress(lambda done, total, text: said.append(done / total), SolveOptions(splittings=2))
+    shares, effects, later = [], list(PHASES)[:3], [*list(PHASES)[3:], "splitting 1", "splitting 2", "lights", "suns"]
+    report = solve_progress(lambda done, total, text: shares.append(done / total), SolveOptions(splittings=2))
     for phase in [*(one for one in effects for _ in range(3)), *later]:
         for iteration in (*range(12), -1):
             report(Event(0, phase, iteration, 1.0, float("nan"), 400))
         if phase in later:
-            assert len(set(said[-13:])) >= 12
-    assert said == sorted(said) and 0 < said[0] < 0.01 and 0.99 < said[-1] < 1
+            assert len(set(shares[-13:])) >= 12
+    assert shares == sorted(shares) and 0 < shares[0] < 0.01 and 0.99 < shares[-1] < 1

@@ -63,10 +63,10 @@ def test_no_sun_is_found_in_a_sky_without_one(seed):
 
 def test_the_solve_keeps_suns_of_lights_that_have_one():
     problem, *_, fit = solved(0.5, 1)
-    found = select_suns(problem, fit, FitRunner())
-    assert found.evidence[0].accepted and found.fit.point.lights[0].suns.any()
-    again = select_suns(problem, found.fit, FitRunner())
-    assert again.fit is found.fit and again.evidence[0].accepted
+    result = select_suns(problem, fit, FitRunner())
+    assert result.evidence[0].accepted and result.fit.point.lights[0].suns.any()
+    again = select_suns(problem, result.fit, FitRunner())
+    assert again.fit is result.fit and again.evidence[0].accepted
     cloudy, *_, fit = solved(0.0, 1)
     none = select_suns(cloudy, fit, FitRunner())
     assert not none.evidence[0].accepted and none.fit.point.lights[0] is fit.point.lights[0]

@@ -163,9 +163,9 @@ def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[SurfaceEstimate
     problem, body = spheres(true, size=18, seed=seed), surfaces()
     given = with_wrong_normals(problem, size)
     at = [attached_to(block.normal, body) for block in problem.blocks]
-    told = Rising()
+    progress = Rising()
     return (
-        estimate_surface(given, body, at, start_from_photos(3), report=lambda share, what: told(share, 1, what)),
+        estimate_surface(given, body, at, start_from_photos(3), report=lambda share, what: progress(share, 1, what)),
         body,
         given,
         problem,
@@ -285,11 +285,11 @@ def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
     place = np.zeros((surfaces.nodes, 3))
     for name, own in surfaces.meshes.items():
         place[surfaces.first_nodes[name] + own.node] = own.mesh.vertices * (scale if name == "pear" else 1)
-    met = np.einsum("nk,nkd->nd", at.share, place[at.node])
+    points = np.einsum("nk,nkd->nd", at.share, place[at.node])
     for number, (pose, name) in enumerate(zip(poses, meshes), start=1):
         rows = (maps.object[y, x] == number) & at.share.any(1)
         assert rows.sum() > 100 and (at.node[rows] >= surfaces.first_nodes[name]).all()
-        np.testing.assert_allclose(pose.apply(met[rows])[:, 2], maps.depth[y, x][rows], atol=1e-4)
+        np.testing.assert_allclose(pose.apply(points[rows])[:, 2], maps.depth[y, x][rows], atol=1e-4)
         np.testing.assert_allclose(at.share[rows].sum(1), 1)
         if name == "apple":  # whose axes are as they were
             np.testing.assert_allclose(at.frame[rows], np.broadcast_to(pose.rotation, (rows.sum(), 3, 3)))

@@ -121,8 +121,8 @@ def test_strangers_read_and_write_nothing(folder):
             page = f"GET /?token={quote(word or '') if name == 'X_Token' else server.token}"
             for asks in (page, "GET /set", "GET /mask/1", "PUT /mask/1", "POST /unsaved/1"):
                 body = bytes(600) if "PUT" in asks else b"1"
-                status, found, _ = asked(server, *asks.split(" "), body, **{"X_Version": version, name: word})
-                assert status == 403 and "Access-Control-Allow-Origin" not in found, (name, word, asks)
+                status, result, _ = asked(server, *asks.split(" "), body, **{"X_Version": version, name: word})
+                assert status == 403 and "Access-Control-Allow-Origin" not in result, (name, word, asks)
         assert asked(server, "GET", f"/?token={server.token}", X_Token=None)[0] == 200
         assert asked(server, "GET", f"/mask/1?token={server.token}", X_Token=None)[0] == 403  # a stranger's link
         assert asked(server, "OPTIONS", "/mask/1")[0] == 501  # a browser asks so whether a stranger may send the header
@@ -150,7 +150,9 @@ def test_in_a_browser_by_mouse_and_keys(folder):
     with served(folder) as server:
         context = started().new_context(viewport={"width": 1440, "height": 900})
         page, complaints = context.new_page(), []
-        page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+        page.on(
+            "console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None
+        )
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.goto(server.url)
 

@@ -92,9 +92,9 @@ FORMS = {
 
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_is_the_same_labels(tmp_path, form):
-    found = labels(tmp_path, FORMS[form](tmp_path))
-    np.testing.assert_array_equal(found.label, LABEL)
-    assert not found.left_out.any()
+    result = labels(tmp_path, FORMS[form](tmp_path))
+    np.testing.assert_array_equal(result.label, LABEL)
+    assert not result.left_out.any()
 
 
 def test_grey_of_few_bits_is_not_stretched_255_is_left_out_or_inside_and_a_soft_edge_is_cut_at_half(tmp_path):
@@ -105,13 +105,13 @@ def test_grey_of_few_bits_is_not_stretched_255_is_left_out_or_inside_and_a_soft_
         np.testing.assert_array_equal(read_values(tmp_path / "a.png", KEY), LABEL > 0)
     values = LABEL.copy()
     values[0] = 255
-    found = labels(tmp_path, save(tmp_path / "a.png", values))
-    np.testing.assert_array_equal(found.label, LABEL)
-    assert found.left_out[0].all() and not found.left_out[1:].any()
+    result = labels(tmp_path, save(tmp_path / "a.png", values))
+    np.testing.assert_array_equal(result.label, LABEL)
+    assert result.left_out[0].all() and not result.left_out[1:].any()
     values = np.zeros((H, W), dtype=np.uint8)
     values[5], values[6], values[7] = 100, 200, 255
-    found = labels(tmp_path, {"white": save(tmp_path / "a.png", values)})
-    assert (found.label[5] == 0).all() and (found.label[6:8] == 2).all() and not found.left_out.any()
+    result = labels(tmp_path, {"white": save(tmp_path / "a.png", values)})
+    assert (result.label[5] == 0).all() and (result.label[6:8] == 2).all() and not result.left_out.any()
 
 
 def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():
@@ -143,8 +143,8 @@ def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
 def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(tmp_path):
     objects = lambda *masks: read_object_indices(masks, lambda name: tmp_path / name, (H, W), "photos[kitchen].objects")  # noqa: E731
     one, three = (save(tmp_path / f"{k}.png", np.uint8(255) * (LABEL == k)) for k in (1, 3))
-    found = objects(("a", None), ("b", three), ("c", one))
-    np.testing.assert_array_equal(found, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
+    result = objects(("a", None), ("b", three), ("c", one))
+    np.testing.assert_array_equal(result, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
     for bad, said in ((LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")):
         error = refusal(said, objects, ("a", one), ("b", save(tmp_path / "bad.png", bad)))
         assert "bad.png: photos[kitchen].objects[1].mask" in str(error)
@@ -193,17 +193,17 @@ def clicked(truth, box):
 @pytest.mark.parametrize("size, most, least", [(60, 10**6, 0.9), (240, 60 * 60, 0.75)])
 def test_a_click_on_each_part_finds_the_parts(size, most, least):
     truth, picture, box = scene(size)
-    found = grow(box, 1, picture, *clicked(truth, box), most)
+    result = grow(box, 1, picture, *clicked(truth, box), most)
     for kind in (1, 2):
-        assert ((found == kind) & (truth == kind)).sum() > least * ((found == kind) | (truth == kind)).sum()
-    assert np.array_equal(found, grow(box, 1, picture, *clicked(truth, box), most))
+        assert ((result == kind) & (truth == kind)).sum() > least * ((result == kind) | (truth == kind)).sum()
+    assert np.array_equal(result, grow(box, 1, picture, *clicked(truth, box), most))
 
 
 def test_a_box_alone_finds_what_is_of_another_colour():
     truth, picture, box = scene(noise=30.0)
     label, sure = clicked(truth, box)
-    found = grow(box, 1, picture, np.minimum(label, 1), np.zeros_like(sure))
-    assert ((found > 0) == (truth > 0)).mean() > 0.98 and set(np.unique(found)) == {0, 1}
+    result = grow(box, 1, picture, np.minimum(label, 1), np.zeros_like(sure))
+    assert ((result > 0) == (truth > 0)).mean() > 0.98 and set(np.unique(result)) == {0, 1}
 
 
 def test_sure_pixels_and_what_is_beside_the_box_stay():
@@ -213,10 +213,10 @@ def test_sure_pixels_and_what_is_beside_the_box_stay():
     twice, wide = picture.repeat(2, 0).repeat(2, 1), [each.repeat(2, 0).repeat(2, 1) for each in (label, sure)]
     wide[0][80, 40:44], wide[1][80, 40:44] = (1, 2, 1, 2), True  # finer than the walk
     assert np.array_equal(grow(tuple(2 * k for k in box), 1, twice, *wide, 3600)[80, 40:44], (1, 2, 1, 2))
-    found = grow(box, 1, picture, label, sure)
+    result = grow(box, 1, picture, label, sure)
     outside = np.ones_like(sure)
     outside[box[1] : box[3], box[0] : box[2]] = False
-    assert np.array_equal(found[sure | outside], label[sure | outside])
+    assert np.array_equal(result[sure | outside], label[sure | outside])
     assert np.array_equal(grow(box, 1, picture, label, np.ones_like(sure)), label)
 
 

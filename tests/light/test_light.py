@@ -37,11 +37,11 @@ def test_table_round_trip_is_exact_and_byte_equal(tmp_path):
     write_lobes(tmp_path / "1.parquet", lights)
     write_lobes(tmp_path / "2.parquet", dict(reversed(lights.items())))
     assert (tmp_path / "1.parquet").read_bytes() == (tmp_path / "2.parquet").read_bytes()
-    found = read_lobes(tmp_path / "1.parquet")
-    assert set(found) == set(lights)
+    result = read_lobes(tmp_path / "1.parquet")
+    assert set(result) == set(lights)
     for name, lobes in lights.items():
         for field in ("axis", "sharpness", "weight"):
-            np.testing.assert_array_equal(getattr(found[name], field), getattr(lobes, field))
+            np.testing.assert_array_equal(getattr(result[name], field), getattr(lobes, field))
 
 
 # ── what is seen of them ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -130,8 +130,8 @@ def test_irradiance_beside_the_middle_is_that_of_rays_to_the_sphere_of_light(pla
     X = CURVATURE * place
     along = X @ SPHERE.T  # of rays in directions AXES from X, t is where they meet the unit sphere
     t = -along + np.sqrt(along**2 + 1 - (X**2).sum(1)[:, None])
-    met = X[:, None] + t[..., None] * SPHERE
-    traced = (np.maximum(normal @ SPHERE.T, 0) * smooth_light(met)).sum(1) * SOLID_ANGLE
+    points = X[:, None] + t[..., None] * SPHERE
+    traced = (np.maximum(normal @ SPHERE.T, 0) * smooth_light(points)).sum(1) * SOLID_ANGLE
     np.testing.assert_allclose(irradiance(nz, larger), traced, rtol=0.01)
     assert np.abs(irradiance(normal @ SPHERE.T, 1.0) / traced - 1).max() > 0.1
 

@@ -102,8 +102,8 @@ def test_gltf_nodes_lie_in_each_other_scaled_then_turned_then_moved(tmp_path):
     ]
     (tmp_path / "a.glb").write_bytes(glb(header))
     expected = turn.apply(VERTICES * (1, 2, 3)) + (6, 6, 7)
-    found = np.unique(read_mesh(tmp_path / "a.glb", MATERIALS, "red").vertices.round(5), axis=0)
-    assert np.allclose(found, np.unique(expected.round(5), axis=0), atol=2e-5)
+    result = np.unique(read_mesh(tmp_path / "a.glb", MATERIALS, "red").vertices.round(5), axis=0)
+    assert np.allclose(result, np.unique(expected.round(5), axis=0), atol=2e-5)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb"])
@@ -111,9 +111,9 @@ def test_normals_of_the_file_are_used(tmp_path, suffix):
     ball = trimesh.creation.icosphere(subdivisions=1)
     tilted = ball.vertex_normals + 0.2 * np.roll(ball.vertex_normals, 1, axis=1)
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
-    made = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=tilted, process=False)
+    built = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=tilted, process=False)
     options = {"vertex_normal": True} if suffix == "ply" else {}
-    (tmp_path / f"ball.{suffix}").write_bytes(made.export(file_type=suffix, **options))
+    (tmp_path / f"ball.{suffix}").write_bytes(built.export(file_type=suffix, **options))
     mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, "red")
     nearest = np.argmin(np.linalg.norm(mesh.vertices[:, None] - ball.vertices, axis=2), axis=1)
     assert np.allclose(mesh.normals, tilted[nearest], atol=1e-5)
@@ -277,8 +277,8 @@ def smooth(body: SubdividedMesh, size: float) -> np.ndarray:
 def test_a_displacement_is_found_from_the_turns_that_it_means():
     body = subdivided_mesh(ball(3))
     true = smooth(body, 0.02)
-    found = body.displacement(body.normal_change(true), np.ones(body.nodes))
-    assert np.std(found - found.mean() - true) < 0.05 * np.std(true)
+    result = body.displacement(body.normal_change(true), np.ones(body.nodes))
+    assert np.std(result - result.mean() - true) < 0.05 * np.std(true)
 
 
 def test_a_ball_that_was_given_as_an_ellipsoid_gets_its_normals_back():

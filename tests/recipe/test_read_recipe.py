@@ -52,7 +52,7 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: insert\nphotos: [kitchen]\nbeside: red_chair", ["no object 'red_chair' in photo 'kitchen'", "yellow_chair", "name the photos"]),
     ("kind: insert\nsize: 0", ["one.yaml:2: size"]),
     ("kind: insert\nmesh: read.py", ["there is no file", "read.py"]),
-    ("kind: insert\nmesh: one.yaml", ["'one.yaml' is no mesh file", ".obj"]),
+    ("kind: insert\nmesh: one.yaml", ["'one.yaml' is not a mesh file", ".obj"]),
     ("kind: relight\nphotos: [kitchen, kitchen]", ["photos", "'kitchen' is named twice"]),
     ("kind: relight\nlights: [hall, hall]", ["lights", "'hall' is named twice"]),
     ("kind: turntable\nseconds: .inf", ["one.yaml:2: seconds"]),

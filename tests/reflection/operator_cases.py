@@ -118,19 +118,19 @@ class Answers(msgspec.Struct, frozen=True):
         return all(bool(t.isfinite().all()) for t in (*self.fields.values(), self.turning))
 
 
-def answers(operator: Operator, given: Pairs) -> Answers:
+def answers(operator: Operator, pairs: Pairs) -> Answers:
     """Compute values and derivatives of all pairs."""
     fields: dict[str, Tensor] = {}
-    turning = torch.empty(len(given), 3, 3, dtype=torch.float64)
-    n, o, z = (t.to(operator.dtype) for t in (given.normal, given.view, given.axis))
+    turning = torch.empty(len(pairs), 3, 3, dtype=torch.float64)
+    n, o, z = (t.to(operator.dtype) for t in (pairs.normal, pairs.view, pairs.axis))
     no, nz, oz = ((a * b).sum(1) for a, b in ((n, o), (n, z), (o, z)))
-    for r, lam, rows in given.groups():
+    for r, lam, rows in pairs.groups():
         roughness = torch.tensor(r, dtype=operator.dtype)
         sharpness = torch.tensor([lam], dtype=operator.dtype)
         response = operator.response(roughness, sharpness, no[rows], nz[rows, None], oz[rows, None])
         for name in response.__struct_fields__:
             column = getattr(response, name)[:, 0].double()
-            fields.setdefault(name, torch.empty(len(given), dtype=torch.float64))[rows] = column
+            fields.setdefault(name, torch.empty(len(pairs), dtype=torch.float64))[rows] = column
         by_no = response.specular_by_no
         by_nz = response.specular_by_nz
         by_oz = response.specular_by_oz
@@ -141,30 +141,30 @@ def answers(operator: Operator, given: Pairs) -> Answers:
     return Answers(fields, turning)
 
 
-def value_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
+def value_error(a: Answers, b: Answers, pairs: Pairs) -> Float[Tensor, " k"]:
     """Return |a − b| / (b + E/100), the greater of diffuse and specular."""
-    parts = [(a.fields[p] - b.fields[p]).abs() / (b.fields[p] + given.scale()) for p in ("diffuse", "specular")]
+    parts = [(a.fields[p] - b.fields[p]).abs() / (b.fields[p] + pairs.scale()) for p in ("diffuse", "specular")]
     return torch.maximum(*parts)
 
 
-def gradient_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
+def gradient_error(a: Answers, b: Answers, pairs: Pairs) -> Float[Tensor, " k"]:
     """Return |∂a − ∂b| / (|∂b| + b + E/100): the greatest of all derivatives that mean something alone."""
-    worst = torch.zeros(len(given), dtype=torch.float64)
+    worst = torch.zeros(len(pairs), dtype=torch.float64)
     for name in ("diffuse_by_log_sharpness", "diffuse_by_nz", "specular_by_roughness", "specular_by_log_sharpness"):
-        base = b.fields[name.partition("_")[0]] + given.scale()
+        base = b.fields[name.partition("_")[0]] + pairs.scale()
         worst = worst.maximum((a.fields[name] - b.fields[name]).abs() / (b.fields[name].abs() + base))
-    size = b.turning.norm(dim=2) + (b.fields["specular"] + given.scale())[:, None]
+    size = b.turning.norm(dim=2) + (b.fields["specular"] + pairs.scale())[:, None]
     return worst.maximum(((a.turning - b.turning).norm(dim=2) / size).amax(1))
 
 
-def reference_values(given: Pairs, some: slice = slice(None)) -> dict[str, Tensor]:
+def reference_values(pairs: Pairs, some: slice = slice(None)) -> dict[str, Tensor]:
     """Compute diffuse and specular by quadrature, of some of the pairs."""
     reference = reflection_operator("reference")
-    n, o, z = (t[some] for t in (given.normal, given.view, given.axis))
+    n, o, z = (t[some] for t in (pairs.normal, pairs.view, pairs.axis))
     no, nz, oz = ((a * b).sum(1) for a, b in ((n, o), (n, z), (o, z)))
-    sharpness = given.sharpness[some, None]
+    sharpness = pairs.sharpness[some, None]
     with torch.no_grad():
-        specular = reference.specular(given.roughness[some, None], sharpness, no, nz[:, None], oz[:, None])[:, 0]
+        specular = reference.specular(pairs.roughness[some, None], sharpness, no, nz[:, None], oz[:, None])[:, 0]
         return {"diffuse": reference.diffuse(sharpness, nz[:, None])[:, 0], "specular": specular}
 
 

@@ -81,8 +81,8 @@ def test_response_is_value_and_finite_differences(name, bound, roughness):
         torch.testing.assert_close(getattr(response, part), value)
         for key in {"diffuse": ("log_sharpness", "nz"), "specular": tuple(point)}[part]:
             up, down = (parts(**(point | {key: point[key] + step}))[part == "specular"] for step in (h, -h))
-            found = getattr(response, f"{part}_by_{key}")
-            error = (found - (up - down) / (2 * h)).abs() / (found.abs() + value + 0.01 / lam)
+            result = getattr(response, f"{part}_by_{key}")
+            error = (result - (up - down) / (2 * h)).abs() / (result.abs() + value + 0.01 / lam)
             assert error.max() < bound, (part, key)
 
 
@@ -90,11 +90,11 @@ def test_response_is_value_and_finite_differences(name, bound, roughness):
 def test_gradients_are_those_of_the_reference(name):
     errors = []
     for roughness in (0.2, 0.4, 0.8):
-        found, exact = (o.response(*grid(roughness, o.dtype, rows=12)) for o in (FAST[name, "float32"], REFERENCE))
+        result, exact = (o.response(*grid(roughness, o.dtype, rows=12)) for o in (FAST[name, "float32"], REFERENCE))
         floor = exact.specular + lobe_integral(grid(roughness)[1]) / 100
         for field in exact.__struct_fields__[4:]:
             true = getattr(exact, field)
-            errors.append((getattr(found, field).double() - true).abs() / (true.abs() + floor))
+            errors.append((getattr(result, field).double() - true).abs() / (true.abs() + floor))
     assert torch.cat([e.reshape(-1) for e in errors]).median() < {"closed_form": 0.06, "network": 0.01}[name]
 
 
@@ -103,8 +103,8 @@ def test_diffuse_is_exact_to_a_thousandth_of_the_peak_in_float32(name):
     """Half the 0.15 % that Tokuyoshi et al. (2024) reach."""
     lam, nz = torch.logspace(-3, 6, 40).double(), torch.linspace(-1, 1, 101).double()
     exact = diffuse_quadrature(*torch.broadcast_tensors(lam[:, None], nz), 80)
-    found = FAST[name, "float32"].diffuse(lam.float(), nz.float()[:, None].expand(-1, 40)).T.double()
-    assert ((found - exact).abs().amax(1) / exact.amax(1)).max() < 7e-4
+    result = FAST[name, "float32"].diffuse(lam.float(), nz.float()[:, None].expand(-1, 40)).T.double()
+    assert ((result - exact).abs().amax(1) / exact.amax(1)).max() < 7e-4
 
 
 def test_errors_of_the_closed_form_and_the_shipped_networks():

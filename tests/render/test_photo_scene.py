@@ -236,7 +236,7 @@ def new(material="red") -> PlacedMesh:
 
 
 @pytest.fixture(scope="module")
-def made():
+def inserted():
     photo = true_photo([THERE])
     return photo, insert_object(stands(SCENE), photo, OPEN, 512)
 
@@ -249,27 +249,29 @@ def blocks(picture):
     return picture.reshape(12, 4, 16, 4, 3).mean(axis=(1, 3))
 
 
-def test_the_composite_is_the_photo_of_the_scene_with_the_object(made):
+def test_the_composite_is_the_photo_of_the_scene_with_the_object(inserted):
     """Shadow on a ground of unknown texture, the object itself, its light on its neighbour: within the noise and the ground's mean colour."""
-    photo, found = made
+    photo, result = inserted
     truth = true_photo([THERE, new()])
-    error, change = np.abs(blocks(found.composite) - blocks(truth)), np.abs(blocks(photo) - blocks(truth))
+    error, change = np.abs(blocks(result.composite) - blocks(truth)), np.abs(blocks(photo) - blocks(truth))
     assert error.mean() < 0.08 * change.mean()
     assert np.sqrt((error**2).mean()) < 0.1 * np.sqrt((change**2).mean())
 
-    assert np.array_equal(found.composite[0], photo[0]) and (found.shadow[0] == 1).all()  # no path joins the sky to it
-    assert STRIPES[0] < found.ground.mean() < STRIPES[1]
+    assert (
+        np.array_equal(result.composite[0], photo[0]) and (result.shadow[0] == 1).all()
+    )  # no path joins the sky to it
+    assert STRIPES[0] < result.ground.mean() < STRIPES[1]
 
 
-def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_object_and_only_there(made):
-    photo, found = made
+def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_object_and_only_there(inserted):
+    photo, result = inserted
     brighter = PhotoScene(CAMERA, (THERE,), light().scale(2.0), MATERIALS)
     polish = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
     matt, polished = (insert_object(stands(SCENE, polish=p), photo, OPEN, 64) for p in (None, polish))
     again = insert_object(stands(brighter), 2 * photo, OPEN, 64)
     assert np.allclose(again.composite, 2 * matt.composite, rtol=1e-4, atol=1e-6)
     difference = np.abs(polished.composite - matt.composite).max(axis=-1)
-    rows, columns = np.nonzero(found.coverage > 0)
+    rows, columns = np.nonzero(result.coverage > 0)
     below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
     assert below.max() > 0.05 and difference[0].max() == 0
 
@@ -292,7 +294,7 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
     assert seen[0] > 100 and seen[1] < 0.9 * seen[0]
 
 
-def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_where_there_is_none(made):
+def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_where_there_is_none(inserted):
     """A photo of its own prediction matches fully; light from elsewhere, less than none; objects' pixels do not count."""
     rng = np.random.default_rng(0)
     lit, constant, where = rng.uniform(0.1, 1, (20, 30, 1)) * np.ones(3), np.ones((20, 30, 3)), np.ones((20, 30), bool)
@@ -377,8 +379,8 @@ def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked
     spot = Spot(LOW, np.array(point), 0.8)
     error = refusal(words, free_placement, scene_of(other), stand, spot, is_requested=True)
     assert error.key == "at" and cure in error.cure
-    new, there, said = free_placement(scene_of(other), stand, spot, is_requested=False)
-    assert words in said
+    new, there, sentence = free_placement(scene_of(other), stand, spot, is_requested=False)
+    assert words in sentence
     x, y = (int(v) for v in error.cure.split("[")[1].split("]")[0].split(","))
     named = unproject_spot(scene_of(other), LOW, new, (x, y), 1.0)  # the place that is named is where it is moved to
     assert np.linalg.norm(named.point - there.point) < 0.25

@@ -31,39 +31,39 @@ FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
 
 
 @pytest.fixture
-def made():
+def inputs():
     return made_export.shared()[0]
 
 
-def run(made, photo, out):
+def run(inputs, photo, out):
     out.mkdir()
-    render.main(FAST, made_export.of_photo(made, photo), out, silent)
+    render.main(FAST, made_export.of_photo(inputs, photo), out, silent)
     return out
 
 
-def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
-    first, second = map(files_of, ([run(made, "side", tmp_path / name) for name in "ab"]))
+def test_pictures_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
+    first, second = map(files_of, ([run(inputs, "side", tmp_path / name) for name in "ab"]))
     stems = [f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES]
     assert set(first) == {f"{stem}.{suffix}" for stem in ["resynthesis/side", *stems] for suffix in ("exr", "png")}
     assert first == second
 
 
 @pytest.mark.parametrize("photo", ["front", "side"])
-def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(made, tmp_path, photo):
+def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(inputs, tmp_path, photo):
     world, light = made_export.WORLD_FROM_CAMERA[photo], made_export.lights()[made_export.LIGHTS[photo]]
     normal = torch.tensor((FRONT if world is None else world @ FRONT)[None])  # in the light's own frame
-    solved, operator = read_materials(made["solve"] / "materials.json").materials, reflection_operator("closed_form")
-    out = run(made, photo, tmp_path / "out")
+    solved, operator = read_materials(inputs["solve"] / "materials.json").materials, reflection_operator("closed_form")
+    out = run(inputs, photo, tmp_path / "out")
     for name in made_export.NAMES:
         expected = operator(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]
         np.testing.assert_allclose(read_rgb_exr(out / "materials" / photo / f"{name}.exr")[16, 16], expected, rtol=2e-3)
 
 
-def test_resynthesis_is_lit_inside_the_mask_alone_and_observed_normals_are_those_of_the_photo(made, tmp_path):
-    out = run(made, "front", tmp_path / "out")
+def test_resynthesis_is_lit_inside_the_mask_alone_and_observed_normals_are_those_of_the_photo(inputs, tmp_path):
+    out = run(inputs, "front", tmp_path / "out")
     picture = read_rgb_exr(out / "resynthesis" / "front.exr")
     assert picture.shape == (made_export.HEIGHT, made_export.WIDTH, 3)
-    np.testing.assert_array_equal(picture.max(-1) > 0, read_exr(made["masks"] / "front.exr")["label"] > 0)
+    np.testing.assert_array_equal(picture.max(-1) > 0, read_exr(inputs["masks"] / "front.exr")["label"] > 0)
     folder = out / "reflectance_maps" / "front"
     disc = np.hypot(*np.meshgrid(*[np.linspace(-1, 1, 32)] * 2)) < 0.9
     assert read_exr(folder / "red.exr")["observed"][disc].mean() > 0.95  # the photo shows a whole ball of it
@@ -71,33 +71,33 @@ def test_resynthesis_is_lit_inside_the_mask_alone_and_observed_normals_are_those
     assert read_rgb_exr(folder / "brass.exr")[16, 16].min() > 0  # and yet it is synthesised
 
 
-def test_unknown_light_is_black_and_said(made, tmp_path, caplog):
-    with instead(made["export"] / "lobes.parquet", lambda file: write_lobes(file, {"front": no_lobes()})):
-        out = run(made, "front", tmp_path / "out")
+def test_unknown_light_is_black_and_said(inputs, tmp_path, caplog):
+    with instead(inputs["export"] / "lobes.parquet", lambda file: write_lobes(file, {"front": no_lobes()})):
+        out = run(inputs, "front", tmp_path / "out")
     assert "nothing is known of its light" in caplog.text
     assert not read_rgb_exr(out / "resynthesis" / "front.exr").any()
 
 
-def with_model(made, **model):
-    file = made["solve"] / "materials.json"
+def with_model(inputs, **model):
+    file = inputs["solve"] / "materials.json"
     table = read_json(file) | {"model": model}
     return instead(file, lambda file: write_json(file, table))
 
 
-def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(made, tmp_path):
-    straight, tone = run(made, "front", tmp_path / "straight"), {"side": {"exponent": 2.0, "pivot": 1.0}}
-    with with_model(made, tone=tone | {"front": {"exponent": 1.5, "pivot": 0.3}}):
-        curved = run(made, "front", tmp_path / "curved")
+def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(inputs, tmp_path):
+    straight, tone = run(inputs, "front", tmp_path / "straight"), {"side": {"exponent": 2.0, "pivot": 1.0}}
+    with with_model(inputs, tone=tone | {"front": {"exponent": 1.5, "pivot": 0.3}}):
+        curved = run(inputs, "front", tmp_path / "curved")
     linear, shown = (read_rgb_exr(of / "resynthesis" / "front.exr") for of in (straight, curved))
     np.testing.assert_allclose(shown, 0.3 * curve(linear / 0.3, 1.5), rtol=1e-4, atol=1e-6)
     other = [p for p in straight.rglob("*.exr") if "resynthesis" not in p.parts]
     assert all(p.read_bytes() == (curved / p.relative_to(straight)).read_bytes() for p in other)
 
 
-def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
+def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(inputs, tmp_path):
     """In the gauge of the solve: the factor that `export` took from the reflectances does not weaken it."""
-    y, x = np.nonzero(read_exr(made["masks"] / "front.exr")["label"] > 0)
-    n, geometry = len(x), read_exr(made["align"] / "front.exr")
+    y, x = np.nonzero(read_exr(inputs["masks"] / "front.exr")["label"] > 0)
+    n, geometry = len(x), read_exr(inputs["align"] / "front.exr")
     visibility = np.where(fibonacci_sphere(64)[:, 1] > 0, 0, 255).astype(
         np.uint8
     )  # the lower half is hidden, by nothing known
@@ -105,32 +105,32 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     columns = {"view": view, "x": x, "y": y, "visibility": np.tile(visibility, (n, 1))}
     columns |= {"occluder": np.full((n, 64), NO_OCCLUDER, np.uint16)}
     radiance, names = np.full((n, 3), 0.3), tuple(made_export.NAMES)
-    seen = observations_from_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
+    observed = observations_from_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
     (tmp_path / "urm").mkdir()
-    write_observations(tmp_path / "urm" / "front.parquet", seen)
-    pictures, hidden = [], msgspec.structs.replace(made, folders={**made.folders, "urm": tmp_path / "urm"})
+    write_observations(tmp_path / "urm" / "front.parquet", observed)
+    pictures, hidden = [], msgspec.structs.replace(inputs, folders={**inputs.folders, "urm": tmp_path / "urm"})
     for bounces in (True, False):
-        with with_model(made, self_shadowing=True, interreflection=bounces):
+        with with_model(inputs, self_shadowing=True, interreflection=bounces):
             out = run(hidden, "front", tmp_path / str(bounces))
         pictures.append(read_rgb_exr(out / "resynthesis" / "front.exr")[y, x])
-    assert read_materials(made["export"] / "materials.json").gauge.export_factor < 1
-    red, sent = made_export.MATERIALS["red"], bounced_light(seen, seen.radiance)
-    expected = np.array(red["diffuse"]) * sent[:, :3] + np.array(red["specular"]) * sent[:, 3:]
+    assert read_materials(inputs["export"] / "materials.json").gauge.export_factor < 1
+    red, bounced = made_export.MATERIALS["red"], bounced_light(observed, observed.radiance)
+    expected = np.array(red["diffuse"]) * bounced[:, :3] + np.array(red["specular"]) * bounced[:, 3:]
     np.testing.assert_allclose(pictures[0] - pictures[1], expected, rtol=1e-3, atol=1e-4)
     assert expected.max() > 0.1
 
 
-def test_a_surface_with_other_normals_and_detail_is_rendered_as_it_is(made, tmp_path):
-    geometry = read_exr(made["align"] / "front.exr")
+def test_a_surface_with_other_normals_and_detail_is_rendered_as_it_is(inputs, tmp_path):
+    geometry = read_exr(inputs["align"] / "front.exr")
     normal, inside = np.stack([geometry[f"normal.{a}"] for a in "xyz"], axis=-1), geometry["object"] > 0
     pictures = []
     for name, detail in (("plain", 1.0), ("painted", 0.5)):
         (tmp_path / name / "photos").mkdir(parents=True)
         channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {"detail": detail * inside}
         write_exr(tmp_path / name / "photos" / "front.exr", channels)
-        on = msgspec.structs.replace(made, folders={**made.folders, "surface": tmp_path / name})
+        on = msgspec.structs.replace(inputs, folders={**inputs.folders, "surface": tmp_path / name})
         pictures.append(read_rgb_exr(run(on, "front", tmp_path / f"out {name}") / "resynthesis" / "front.exr"))
-    given = read_rgb_exr(run(made, "front", tmp_path / "given") / "resynthesis" / "front.exr")
+    given = read_rgb_exr(run(inputs, "front", tmp_path / "given") / "resynthesis" / "front.exr")
     np.testing.assert_allclose(pictures[0], given, rtol=1e-5, atol=1e-6)
     assert (pictures[1] <= given + 1e-6).all() and pictures[1].sum() < 0.9 * given.sum()
 
@@ -169,8 +169,8 @@ def test_radiance_is_the_integral_over_the_exported_map():
     texels = light_map * lat_long_solid_angles(128, 256)[:, None, None]
     incoming = (lat_long_directions(128, 256) @ YUP_FROM_CAMERA).reshape(-1, 3)
     expected = reflected(GLOSSY, normals, views, incoming, texels.reshape(-1, 3))
-    found = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, normals, views)
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    result = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, normals, views)
+    np.testing.assert_allclose(result, expected, rtol=2e-3)
 
 
 @pytest.mark.parametrize("roughness, sharpest", [(0.1, 900.0), (0.3, 900.0), (0.3, 2e5), (0.6, 900.0)])
@@ -188,12 +188,12 @@ def test_balls_are_the_operator_at_every_pixel(roughness, sharpest):
 
 
 def test_chunks_do_not_show(monkeypatch):
-    operator, seen = reflection_operator("closed_form"), []
+    operator, reports = reflection_operator("closed_form"), []
     whole = Reflector(operator, light())(GLOSSY, *points(50))
     monkeypatch.setattr("factorlib.render.resynthesis.PAIRS_AT_ONCE", 35)
-    parts = Reflector(operator, light())(GLOSSY, *points(50), report=lambda done, total: seen.append((done, total)))
+    parts = Reflector(operator, light())(GLOSSY, *points(50), report=lambda done, total: reports.append((done, total)))
     np.testing.assert_allclose(parts, whole, rtol=1e-6)
-    assert seen[0] == (7, 50) and seen[-1] == (50, 50)
+    assert reports[0] == (7, 50) and reports[-1] == (50, 50)
 
 
 @pytest.mark.parametrize("lit, facing", [(no_lobes(), 1), (light().scale(0.0), 1), (light(), -1)])
@@ -205,8 +205,8 @@ def test_darkness_is_black_and_so_is_what_faces_away(lit, facing):
 def test_shadows_that_hide_nothing_change_nothing_and_those_that_hide_all_leave_darkness():
     reflector, (normals, views) = Reflector(reflection_operator("closed_form"), light()), points(40)
     for level, factor in ((255, 1.0), (0, 0.0)):
-        found = reflector(GLOSSY, normals, views, effects=PointEffects(visibility=np.full((40, 256), level, np.uint8)))
-        np.testing.assert_allclose(found, factor * reflector(GLOSSY, normals, views), rtol=1e-5, atol=2e-3)
+        result = reflector(GLOSSY, normals, views, effects=PointEffects(visibility=np.full((40, 256), level, np.uint8)))
+        np.testing.assert_allclose(result, factor * reflector(GLOSSY, normals, views), rtol=1e-5, atol=2e-3)
 
 
 def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():

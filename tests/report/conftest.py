@@ -6,7 +6,7 @@ from tests.report.test_page import LINKED, run
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory):
+def report_page(tmp_path_factory):
     """Its folder, the inputs of `report`, and the page."""
     folder = tmp_path_factory.mktemp("page")
     return folder, *run(folder, seen=LINKED)

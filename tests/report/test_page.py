@@ -76,8 +76,8 @@ def run(folder, log=LOG, **made) -> tuple[Inputs, str]:
 
 def page_of(inputs, out) -> str:
     out.mkdir()
-    report.main(report.Params(), inputs, out, told := Rising())
-    assert told.moves >= len(inputs.facts["dataset.set"]["photos"]) + 3
+    report.main(report.Params(), inputs, out, progress := Rising())
+    assert progress.moves >= len(inputs.facts["dataset.set"]["photos"]) + 3
     return (out / "index.html").read_text(encoding="utf-8")
 
 
@@ -88,51 +88,53 @@ def parsed(html) -> Strict:
     return parser
 
 
-def test_it_is_well_formed_has_every_section_and_asks_for_nothing_outside_the_file(made):
-    found = parsed(made[2])
+def test_it_is_well_formed_has_every_section_and_asks_for_nothing_outside_the_file(report_page):
+    result = parsed(report_page[2])
     tables = {
         f"table-{key}" for key in ("resynthesis", "materials", "relighting", "unobserved", "light", "normals", "poses")
     }
-    assert CONTENTS | tables <= set(found.ids) and len(set(found.ids)) == len(found.ids)
-    files = [link for link in found.links if link.startswith("../")]  # followed, never asked for
-    assert all(link.startswith(("data:image/png;base64,", "#")) for link in found.links if link not in files)
-    assert all(link[1:] in found.ids for link in found.links if link.startswith("#"))
-    folders = made[1].folders
+    assert CONTENTS | tables <= set(result.ids) and len(set(result.ids)) == len(result.ids)
+    files = [link for link in result.links if link.startswith("../")]  # followed, never asked for
+    assert all(link.startswith(("data:image/png;base64,", "#")) for link in result.links if link not in files)
+    assert all(link[1:] in result.ids for link in result.links if link.startswith("#"))
+    folders = report_page[1].folders
     assert {"../export/materials.json", "../export/illumination/noon.exr", "../evaluate/metrics.json"} <= {*files}
     assert all((folders[stage] / path).is_file() for _, stage, path in (link.split("/", 2) for link in files))
-    assert not re.search(r"url\(|@import|<script|<link|https?://", OURS.sub("", made[2]))
-    scripts = "".join(m.group() for m in OURS.finditer(made[2]))
+    assert not re.search(r"url\(|@import|<script|<link|https?://", OURS.sub("", report_page[2]))
+    scripts = "".join(m.group() for m in OURS.finditer(report_page[2]))
     assert not re.search(r"fetch\(|import\(|XMLHttpRequest|https?://|//cdn", scripts)
 
 
-def test_every_picture_decodes_and_says_what_it_is(made, tmp_path):
-    found = parsed(made[2])
-    pictures = [link for link in found.links if link.startswith("data:")]
+def test_every_picture_decodes_and_says_what_it_is(report_page, tmp_path):
+    result = parsed(report_page[2])
+    pictures = [link for link in result.links if link.startswith("data:")]
     # of the first screen, photos × panels, materials, balls, measured and solved maps, lights × (map, darker, truth, spheres), overlays
     assert len(pictures) == 3 + 3 * 4 + 3 + 9 + 5 + 9 + 3 * 4 + 3
     for k, uri in enumerate(pictures):
         path = tmp_path / f"{k}.png"
         path.write_bytes(base64.b64decode(uri.split(",")[1], validate=True))
         assert read_png(path).size > 0
-    assert all(found.alts)
+    assert all(result.alts)
 
 
-def test_the_numbers_are_those_of_the_metrics_and_of_the_training_in_order(made):
-    metrics = read_json(made[0] / "evaluate" / "metrics.json")
-    assert f"{metrics['resynthesis']['mean']['none']['estimate']['psnr_tonemapped_db']:.1f}" in made[2]
-    assert f"{metrics['materials']['mean_roughness']:.3f}" in made[2]
-    section, bins = made[2].split('id="training"')[1].split('id="cost"')[0], ["0.3 to 3", "3 to 30", "30 to 300"]
+def test_the_numbers_are_those_of_the_metrics_and_of_the_training_in_order(report_page):
+    metrics = read_json(report_page[0] / "evaluate" / "metrics.json")
+    assert f"{metrics['resynthesis']['mean']['none']['estimate']['psnr_tonemapped_db']:.1f}" in report_page[2]
+    assert f"{metrics['materials']['mean_roughness']:.3f}" in report_page[2]
+    section, bins = report_page[2].split('id="training"')[1].split('id="cost"')[0], ["0.3 to 3", "3 to 30", "30 to 300"]
     order = [section.index(f">{name}</th>") for name in ("specular", "sharpness", *bins, "diffuse")]
     assert order == sorted(order) and "0.20 %" in section
 
 
-def test_only_the_cost_section_depends_on_the_log(made, tmp_path):
-    _, inputs, html = made
+def test_only_the_cost_section_depends_on_the_log(report_page, tmp_path):
+    _, inputs, html = report_page
     again = page_of(msgspec.structs.replace(inputs, log=None), tmp_path / "again")
     without = [re.sub(r"<!-- begin cost.*end cost -->", "", text, flags=re.DOTALL) for text in (again, html)]
     assert without[0] == without[1] and again != html
     assert "1 min 23 s" in html and "photo &#39;day&#39; &lt;is&gt; dark" in html
-    figures = [sorted((folder / "figures").rglob("*.png")) for folder in (made[0] / "report", tmp_path / "again")]
+    figures = [
+        sorted((folder / "figures").rglob("*.png")) for folder in (report_page[0] / "report", tmp_path / "again")
+    ]
     assert [p.read_bytes() for p in figures[0]] == [p.read_bytes() for p in figures[1]] and len(figures[0]) == 3
 
 
@@ -169,8 +171,8 @@ def test_odd_sets_give_a_whole_page(odd, tmp_path):
     parsed(page_of(inputs, tmp_path / "plain"))
 
 
-def test_a_doubtful_pose_says_why_and_what_to_do(made, tmp_path):
-    _, inputs, html = made
+def test_a_doubtful_pose_says_why_and_what_to_do(report_page, tmp_path):
+    _, inputs, html = report_page
     shutil.copytree(inputs["align"], tmp_path / "align")
     poses = read_json(tmp_path / "align" / "poses.json")
     poses["noon"]["objects"]["balls"] |= {
@@ -298,7 +300,11 @@ def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
     page = (project.build / "compare" / "before-set" / "index.html").read_text()
     assert html.escape("upper: parameter times: default -> 2") in page and page.count("<li>") == 1
     refusal(
-        "is no folder of results\n  known are: 'set'", verbs.compare, project, tmp_path / "before", tmp_path / "nothing"
+        "is not a folder of results\n  known are: 'set'",
+        verbs.compare,
+        project,
+        tmp_path / "before",
+        tmp_path / "nothing",
     )
     project = Project(toy.make_project(tmp_path / "new").root, Provider(("photo",), toy.read))  # where nothing was run
     refusal("make all DATASET=<name> makes one", verbs.compare, project, tmp_path / "a", tmp_path / "b")

@@ -49,19 +49,22 @@ def numbers(text: str, kind: str, columns: int) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), kind).reshape(-1, columns)
 
 
-def test_meshes_keep_their_shape_and_stand_as_in_the_photo(made):
-    (found,), objects = (viewed(made[1])[name] for name in ("meshes", "objects"))
-    assert (found["name"], found["simplified_from"]) == ("ball", None)
+def test_meshes_keep_their_shape_and_stand_as_in_the_photo(report_page):
+    (result,), objects = (viewed(report_page[1])[name] for name in ("meshes", "objects"))
+    assert (result["name"], result["simplified_from"]) == ("ball", None)
     assert [(each["photo"], each["mesh"]) for each in objects] == [(photo, 0) for photo in LINKED]
     for each in objects:
         assert np.allclose(np.reshape(each["rotation"], (3, 3)), YUP_FROM_CAMERA) and np.allclose(
             each["eye"], [0, 0, 1]
         )
         assert each["materials"] == ["brass", "red", "white"]
-    vertices, normals = numbers(found["vertices"], "<u2", 3) / 32767.5 - 1, numbers(found["normals"], "<i2", 3) / 32767
+    vertices, normals = (
+        numbers(result["vertices"], "<u2", 3) / 32767.5 - 1,
+        numbers(result["normals"], "<i2", 3) / 32767,
+    )
     assert np.allclose(np.linalg.norm(vertices, axis=1), 1, atol=4e-3)  # a sphere about its middle
     assert np.allclose(vertices, normals, atol=0.01)
-    assert not numbers(found["sight"]["counts"], "<u2", 1).any()  # no convex mesh hides anything from itself
+    assert not numbers(result["sight"]["counts"], "<u2", 1).any()  # no convex mesh hides anything from itself
 
 
 def floor_and_plate(open_=False) -> Mesh:
@@ -86,7 +89,7 @@ def test_under_a_plane_no_light_comes_from_above(tmp_path, open_):
     edges = [np.ptp(place[numbers(part, "<u4", 3)], axis=1).max() for part in packed["parts"]]
     assert packed["open"] == open_ and len(directions) == 256 and max(edges) < 0.2  # two triangles a side before
     counts = numbers(sight["counts"], "<u2", 1)[:, 0]
-    vertex, k, met = (
+    vertex, k, occluder = (
         np.repeat(np.arange(len(counts)), counts),
         numbers(sight["hidden"], "u1", 1)[:, 0],
         numbers(sight["met"], "<u2", 1)[:, 0],
@@ -97,26 +100,26 @@ def test_under_a_plane_no_light_comes_from_above(tmp_path, open_):
     middle = upward[np.linalg.norm(place[upward, :2], axis=1).argmin()]
     mine, above = vertex == middle, np.flatnonzero(directions[:, 2] > 0.82)
     assert set(above) <= set(k[mine]) and (directions[k[mine], 2] > 0.55).all()
-    assert (normals[met[mine], 2] < -0.9).all() and (place[met[mine], 2] > ground + 0.3).all()
-    there = met < len(normals)
+    assert (normals[occluder[mine], 2] < -0.9).all() and (place[occluder[mine], 2] > ground + 0.3).all()
+    there = occluder < len(normals)
     assert (
-        np.sum(normals[met[there]] * directions[k[there]], axis=1) < 0
+        np.sum(normals[occluder[there]] * directions[k[there]], axis=1) < 0
     ).all() and there.any()  # the side that is met
     assert not np.isin(vertex, np.flatnonzero((normals[:, 2] > 0.9) & (place[:, 2] > high - 0.02))).any()
 
 
-def test_large_meshes_are_simplified_and_the_page_says_so(made, tmp_path, monkeypatch):
+def test_large_meshes_are_simplified_and_the_page_says_so(report_page, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "MOST_TRIANGLES", 2000)
     monkeypatch.setattr(viewer, "MOST_VERTICES", 1)  # no room for more vertices than it has
-    (found,) = viewed(made[1])["meshes"]
-    triangles = sum(len(numbers(part, "<u4", 3)) for part in found["parts"])
-    assert found["simplified_from"] == len(sphere().faces) and triangles <= 2100
-    assert "is simplified for this page" in page_of(made[1], tmp_path / "simplified")
+    (result,) = viewed(report_page[1])["meshes"]
+    triangles = sum(len(numbers(part, "<u4", 3)) for part in result["parts"])
+    assert result["simplified_from"] == len(sphere().faces) and triangles <= 2100
+    assert "is simplified for this page" in page_of(report_page[1], tmp_path / "simplified")
 
 
-def test_a_name_cannot_end_the_script(made, tmp_path):
+def test_a_name_cannot_end_the_script(report_page, tmp_path):
     evil = "</script><script>alert(1)</script>"
-    inputs, names, folders = made[1], ["brass", evil, "white"], {}
+    inputs, names, folders = report_page[1], ["brass", evil, "white"], {}
     for stage in ("export", "solve"):
         folders[stage] = shutil.copytree(inputs[stage], tmp_path / stage)
         table = folders[stage] / "materials.json"
@@ -133,10 +136,10 @@ def test_a_name_cannot_end_the_script(made, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def browser(made):
+def browser(report_page):
     """Not across processes: Playwright's loop lives in this one."""
     size, allowed = {"width": 1440, "height": 900}, ["clipboard-read", "clipboard-write"]
-    with opened(made[0] / "report" / "index.html", viewport=size, permissions=allowed) as (page, complaints):
+    with opened(report_page[0] / "report" / "index.html", viewport=size, permissions=allowed) as (page, complaints):
         page.evaluate(f"viewer.canvas.style.width = '{SIZE}px'")  # software draws slowly
         page.evaluate("viewer.canvas.scrollIntoView()")  # it draws only while it is seen
         yield page, complaints
@@ -150,9 +153,9 @@ def browser(made):
 def test_it_shows_what_the_pipeline_renders(browser, material, view):
     """The glossiest material and the roughest; 2 % at the 95th percentile of pixels."""
     normals, views, inside = ball_seen(view.get("azimuth", 0.0), view.get("elevation", 0.0), SIZE)
-    found = shown(browser[0], -1, material, "noon", view, SIZE)[inside]
+    result = shown(browser[0], -1, material, "noon", view, SIZE)[inside]
     want = rendered(lobes_of(1), perturbed(TRUE[material], 1.0), normals, views, view.get("turn", 0.0))
-    assert np.percentile(error(found[:, :3], want), 95) < 0.02 and np.allclose(found[:, 3], 1, atol=1e-5)
+    assert np.percentile(error(result[:, :3], want), 95) < 0.02 and np.allclose(result[:, 3], 1, atol=1e-5)
 
 
 FURNACE = """() => {
@@ -164,12 +167,15 @@ FURNACE = """() => {
 
 
 @needs_chromium
-def test_what_is_hidden_sends_what_it_gets(made, tmp_path):
+def test_what_is_hidden_sends_what_it_gets(report_page, tmp_path):
     """In a sky of radiance 1 white is 1 everywhere, mirrored or not; the middle of the floor loses half of the light to a black disc, and two
     colours of that half to a red one; where the floor mirrors the black disc it is dark."""
-    export = shutil.copytree(made[1]["export"], tmp_path / "export")
+    export = shutil.copytree(report_page[1]["export"], tmp_path / "export")
     write_glb(export / "ball.glb", floor_and_plate(), ["red", "white"], TRUE)
-    page_of(msgspec.structs.replace(made[1], folders={**made[1].folders, "export": export}), tmp_path / "report")
+    page_of(
+        msgspec.structs.replace(report_page[1], folders={**report_page[1].folders, "export": export}),
+        tmp_path / "report",
+    )
     azimuth = np.pi / 2 + np.radians(35)  # 35° above the floor, whose up is the camera's forward
     back, right = np.array([np.sin(azimuth), 0, np.cos(azimuth)]), np.array([np.cos(azimuth), 0, -np.sin(azimuth)])
     with opened(tmp_path / "report" / "index.html", viewport={"width": 1440, "height": 900}) as (page, complaints):
@@ -268,25 +274,25 @@ def test_no_object_burns_out(browser):
         page.evaluate(f"viewer.data.photos[0].exposure = {given}, viewer.renderer.metered = null")
         state = "{...viewer.state(), photo: viewer.data.photos[0], object: viewer.renderer.objects[0]}"
         exposure = page.evaluate(f"viewer.renderer.exposure({{...{state}, azimuth: 1, turn: 2, zoom: 3, sky: true}})")
-        found = shown(page, 0, "", page.evaluate("viewer.data.photos[0].name"), size=64)
-        bright = exposure * np.quantile(found[found[..., 3] > 0.99][:, :3].max(axis=1), 0.98)
+        result = shown(page, 0, "", page.evaluate("viewer.data.photos[0].name"), size=64)
+        bright = exposure * np.quantile(result[result[..., 3] > 0.99][:, :3].max(axis=1), 0.98)
         assert bright == pytest.approx(0.9, abs=0.05) if given > 1 else exposure == given
     page.evaluate("viewer.data.photos[0].exposure = 1, viewer.renderer.metered = null")
     assert browser[1] == []  # last, after everything above
 
 
 @needs_chromium
-def test_without_webgl_it_says_so(made, tmp_path):
-    (tmp_path / "index.html").write_text(made[2].replace('canvas.getContext("webgl2"', 'null && ("webgl2"'))
+def test_without_webgl_it_says_so(report_page, tmp_path):
+    (tmp_path / "index.html").write_text(report_page[2].replace('canvas.getContext("webgl2"', 'null && ("webgl2"'))
     with opened(tmp_path / "index.html") as (page, complaints):
         assert "this browser offers no WebGL 2" in page.inner_text("#viewer-missing")
         assert not page.is_visible("#viewer") and complaints == []
 
 
-def test_what_is_known_of_a_lamp_is_measured_by_the_lamp(made, tmp_path):
+def test_what_is_known_of_a_lamp_is_measured_by_the_lamp(report_page, tmp_path):
     """An error of twice the mean radiance is small where the light is brighter than that."""
-    run = artifacts(made[1])
-    export = shutil.copytree(made[1]["export"], tmp_path / "export")
+    run = artifacts(report_page[1])
+    export = shutil.copytree(report_page[1]["export"], tmp_path / "export")
     run = msgspec.structs.replace(run, folders={**run.folders, "export": export})
     light = run.rgb("export", "illumination/day")
     (export / "coverage").mkdir()

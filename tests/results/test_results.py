@@ -78,4 +78,4 @@ def test_a_missing_material_is_named(tmp_path):
 def test_a_mirrored_pose_is_refused(tmp_path):
     mirrored = (EYE[0], EYE[1], (0.0, 0.0, -1.0))
     write_json(tmp_path / "a.json", PhotoPoses(HALL.camera, {"vase": ObjectPose(mirrored, (0.0, 0.0, 2.0))}))
-    assert refusal("no rotation matrix", read_photo_poses, tmp_path / "a.json").key == "objects.vase"
+    assert refusal("not a rotation matrix", read_photo_poses, tmp_path / "a.json").key == "objects.vase"

@@ -294,14 +294,14 @@ PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: tcp://a:1\nsta
     (ON_DASK, "", "tcp://a:1"),
     (ON_DASK, "executor=processes", "processes"),
     (PLAIN, "executor=dusk", "SET executor=dusk: "),
-    (PLAIN, "exectuor=dask", "SET: 'exectuor=dask' is no setting"),
+    (PLAIN, "exectuor=dask", "SET: 'exectuor=dask' is not a setting"),
     ("executor: dusk\n" + PLAIN, "", "pipeline.yaml:1: executor: "),
     ("executer: dask\n" + PLAIN, "", "did you mean 'executor'?"),
 ])  # fmt: skip
 def test_where_steps_run_stands_in_pipeline_yaml_and_a_setting_replaces_it(tmp_path, text, setting, expected):
     write(tmp_path / "pipeline.yaml", text)
     try:
-        found = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting]).executor
+        result = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting]).executor
     except InputError as error:
-        found = str(error)
-    assert expected in found
+        result = str(error)
+    assert expected in result

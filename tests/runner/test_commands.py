@@ -161,7 +161,7 @@ OWN = ["PY", "STAGES", "GOAL"]  # the Makefile's own
 
 
 @pytest.fixture
-def made(tmp_path):
+def checkout_copy(tmp_path):
     """A checkout that has this one's code, and data sets and results of its own."""
     root = tmp_path / "a checkout"
     (root / "data").mkdir(parents=True)
@@ -177,19 +177,21 @@ def made(tmp_path):
 def by_make(checkout, *words, **environment):
     clean = {k: v for k, v in os.environ.items() if k not in (*VARIABLES, *OWN, "MAKEFLAGS", "MAKELEVEL", "MFLAGS")}
     options = {"capture_output": True, "text": True, "timeout": 600, "check": False}
-    done = subprocess.run(["make", *words], cwd=checkout, env=clean | environment, **options)
+    process = subprocess.run(["make", *words], cwd=checkout, env=clean | environment, **options)
     assert not [p for p in checkout.rglob(PWNED) if p.name == PWNED], "a command was run"
-    assert "Traceback" not in done.stderr
-    return done
+    assert "Traceback" not in process.stderr
+    return process
 
 
-def test_no_variable_is_expanded_on_its_way(made):
+def test_no_variable_is_expanded_on_its_way(checkout_copy):
     """Each variable holds another try, on the command line and, shifted, in the environment."""
     spy = f"#!{sys.executable}\nimport json, os, sys\nprint(json.dumps([sys.argv[1:], dict(os.environ)]))\n"
-    write(made / ".venv" / "bin" / "python", spy)
+    write(checkout_copy / ".venv" / "bin" / "python", spy)
     for shift in (0, 5):
         given = dict(zip((*VARIABLES, *OWN), cycle(TRIES[shift:] + TRIES[:shift])))
-        done = by_make(made, "plan", *(map("=".join, given.items()) if not shift else ()), **(given if shift else {}))
-        arguments, environment = json.loads(done.stdout)
+        process = by_make(
+            checkout_copy, "plan", *(map("=".join, given.items()) if not shift else ()), **(given if shift else {})
+        )
+        arguments, environment = json.loads(process.stdout)
         assert arguments == ["-m", "factorlib", "plan"] and environment["GOAL"] == "plan"
         assert {name: environment[name] for name in VARIABLES} == {name: given[name] for name in VARIABLES}

@@ -28,8 +28,8 @@ OVER_RECIPES = '  shout: {inputs: [upper], over: recipe, optional: true, makes: 
 
 
 def reading(path: Path) -> Recipe:
-    said = json.loads(path.read_text())
-    return Recipe(said, {said["file"]: path.parent / said["file"]} if said.get("file") else {})
+    output = json.loads(path.read_text())
+    return Recipe(output, {output["file"]: path.parent / output["file"]} if output.get("file") else {})
 
 
 @pytest.fixture
@@ -60,8 +60,8 @@ def said(project, recipe):
 
 
 def to_run(project, *recipes, targets=("shout",)):
-    seen = read_state(project, Request("set", list(targets), recipes=recipes))
-    return [str(p.step) for p in seen.plan() if p.status != "current"]
+    state = read_state(project, Request("set", list(targets), recipes=recipes))
+    return [str(p.step) for p in state.plan() if p.status != "current"]
 
 
 def make(project, *recipes, targets=("render",), **more):

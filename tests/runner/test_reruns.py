@@ -77,11 +77,11 @@ def edited(project, name: str, content: bytes):
 
 def below(project, stages):
     """The steps of those stages, and all that take their results, however far: read from pipeline.yaml, step by step."""
-    found = {step for step in usual(project) if step.partition("/")[0] in stages}
+    result = {step for step in usual(project) if step.partition("/")[0] in stages}
     for name in PIPELINE.order():
         of = (step for step in usual(project) if step.partition("/")[0] == name)
-        found |= {step for step in of if any(_takes(step, above) for above in found)}
-    return found
+        result |= {step for step in of if any(_takes(step, above) for above in result)}
+    return result
 
 
 def _takes(step, above):
@@ -207,22 +207,22 @@ def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(rea
     for name in ("kitchen.jpg", "hall.jpg", "mask.png", "own.png", "chair.obj", "vase.ply"):
         write(tmp_path / "set" / name, "")
 
-    def planned_with(spec=SET, settings=(), made=()):
+    def planned_with(spec=SET, settings=(), planned=()):
         write(tmp_path / "set" / "dataset.yaml", yaml.safe_dump(spec))
-        found = read_state(real, Request(str(tmp_path / "set"), settings=settings))
-        listing = Listing({p.key: p.output for p in made}, {str(p.step): p.record for p in made})
-        return plan(found.spec, found.records, listing if made else Listing(Everything(), {}))
+        result = read_state(real, Request(str(tmp_path / "set"), settings=settings))
+        listing = Listing({p.key: p.output for p in planned}, {str(p.step): p.record for p in planned})
+        return plan(result.spec, result.records, listing if planned else Listing(Everything(), {}))
 
-    def why(made, spec=SET, settings=()):
-        return "\n".join(verbs.plan_lines(planned_with(spec, settings, made), True))
+    def why(planned, spec=SET, settings=()):
+        return "\n".join(verbs.plan_lines(planned_with(spec, settings, planned), True))
 
-    made, lobes = planned_with(), ["solve.lobes=48"]
+    planned, lobes = planned_with(), ["solve.lobes=48"]
     for place, value, line in FIELDS:
-        text = why(made, edited_data(SET, *(int(w) if w.isdigit() else w for w in place.split(".")), value=value))
+        text = why(planned, edited_data(SET, *(int(w) if w.isdigit() else w for w in place.split(".")), value=value))
         assert line in text and "changed" not in text.replace("file ", "")
     linear = edited_data(SET, "photos", value=[photo | {"encoding": "linear"} for photo in SET["photos"]])
-    assert why(made, linear).count("encoding") == 1, "what changed in every photo is said once"
-    assert "parameter lobes: default -> 48" in why(made, settings=lobes)
+    assert why(planned, linear).count("encoding") == 1, "what changed in every photo is said once"
+    assert "parameter lobes: default -> 48" in why(planned, settings=lobes)
     assert "parameter lobes: 48 -> default" in why(planned_with(settings=lobes))
     write(project.root / "stages" / "table.py", toy.TABLE.replace("scale: int = 2", "scale: int = 3"))
     assert reasons(project, "table") == ["source of stages.table: changed"]

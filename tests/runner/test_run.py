@@ -69,8 +69,8 @@ def test_a_change_reruns_what_it_reaches(project, file, text, step, reason, runs
         (project.root / file).unlink()
     assert reasons(project, step) == ([reason] if reason else [])
     assert new_runs(project) == runs
-    shown = {path.stem for path in (project.build / "set" / "upper").glob("*.txt")}
-    assert shown == set(toy.read(project.root / "data" / "set").photos)
+    photos = {path.stem for path in (project.build / "set" / "upper").glob("*.txt")}
+    assert photos == set(toy.read(project.root / "data" / "set").photos)
 
 
 def test_a_parameter_reruns_its_stage_and_the_old_result_is_still_there_and_force_runs_just_what_is_named(project):
@@ -85,20 +85,20 @@ def test_the_verdict_of_a_result_is_shown_and_only_when_asked_for_decides_the_ex
         write(project.build / "set" / verbs.VERDICT, text)
         assert verbs.make(project, verbs.Request("set")) == 0
         assert verbs.make(project, verbs.Request("set"), strict=True) == code
-        said = capsys.readouterr().out
-        assert all(said.count(line) == 2 for line in text.splitlines())
+        output = capsys.readouterr().out
+        assert all(output.count(line) == 2 for line in text.splitlines())
     assert verbs.make(project, verbs.Request("set", ["upper"]), strict=True) == 0  # not of the whole
 
 
 def test_plan_why_and_graph_show_the_same_plan(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "Alphabet")
-    for show, said in (
+    for show, output in (
         (verbs.show_plan, "upper      to run  a                        file a.txt: changed"),
         (partial(verbs.show_plan, every_reason=True), "upper      to run  a\n    file a.txt: changed"),
     ):
-        assert show(project, verbs.Request("set")) == 0 and said in capsys.readouterr().out
-    for mermaid, said in ((False, "total      whole set  <- count, table"), (True, "upper --> count")):
-        assert verbs.show_graph(project, mermaid) == 0 and said in capsys.readouterr().out
+        assert show(project, verbs.Request("set")) == 0 and output in capsys.readouterr().out
+    for mermaid, output in ((False, "total      whole set  <- count, table"), (True, "upper --> count")):
+        assert verbs.show_graph(project, mermaid) == 0 and output in capsys.readouterr().out
 
 
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -112,8 +112,8 @@ def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(proje
     for setting, words in (("table.scael=3", "did you mean 'scale'"), ("count.x=1", "unknown key 'x'")):
         for verb in (verbs.make, verbs.show_plan):
             assert verb(project, verbs.Request("set", settings=[setting])) == 1
-            said = capsys.readouterr().err
-            assert said.startswith(f"error: SET {setting}: ") and words in said and "nothing was run" in said
+            output = capsys.readouterr().err
+            assert output.startswith(f"error: SET {setting}: ") and words in output and "nothing was run" in output
 
 
 @pytest.mark.parametrize("param, value", [("times", "0"), ("times", "two"), ("sleep", "[1]")])
@@ -121,12 +121,12 @@ def test_a_value_out_of_bounds_is_refused_before_anything_runs_and_says_who_gave
     before = done(project)
     for verb in (verbs.make, verbs.show_plan):
         assert verb(project, verbs.Request("set", settings=[f"upper.{param}={value}"])) == 1
-        said = capsys.readouterr()
-        assert f": SET upper.{param}={value}: " in said.err and "pipeline.yaml" not in said.err and not said.out
+        output = capsys.readouterr()
+        assert f": SET upper.{param}={value}: " in output.err and "pipeline.yaml" not in output.err and not output.out
     edit(project, "pipeline.yaml", "upper: {", f"upper: {{params: {{{param}: {value}}}, ")
     assert verbs.show_plan(project, verbs.Request("set")) == 1 and done(project) == before
-    said = capsys.readouterr().err
-    assert "pipeline.yaml: " in said and f"stages.upper.params.{param}: " in said and "SET" not in said
+    output = capsys.readouterr().err
+    assert "pipeline.yaml: " in output and f"stages.upper.params.{param}: " in output and "SET" not in output
 
 
 def test_a_dataset_that_is_not_there_and_two_folders_of_one_name_are_refused(project, tmp_path):
@@ -147,8 +147,8 @@ def test_a_failing_step_holds_up_only_what_needs_it(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "bad")
     write(project.root / "data" / "set" / "c.txt", "Gamma")
     assert make(project) == 1
-    said = capsys.readouterr().err
-    assert "upper/a: a.txt: line 1: a bad word" in said and "use a better one" in said and "Traceback" not in said
+    output = capsys.readouterr().err
+    assert "upper/a: a.txt: line 1: a bad word" in output and "use a better one" in output and "Traceback" not in output
     assert done(project)[-2:] == ["upper/c", "count/c"] and state(project)["count/c"] == "current"
     assert not (project.build / "set" / "upper" / "a.txt").exists(), "a result that is not current is shown"
     write(project.root / "data" / "set" / "a.txt", "good")
@@ -169,8 +169,8 @@ def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
 ):
     text = edit(project, file, old, new)
     assert make(project) == 1
-    said = capsys.readouterr().err
-    assert words in said and ("a defect of the program" in said) == ("Traceback" in said) == traced
+    output = capsys.readouterr().err
+    assert words in output and ("a defect of the program" in output) == ("Traceback" in output) == traced
     event = json.loads((project.build / "set" / "log.jsonl").read_text().splitlines()[-1])
     assert event["event"] == "failed" and words.removeprefix("table: ") in event["text"]
     assert ("Traceback" in (event["traceback"] or "")) == traced
@@ -191,12 +191,12 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
 
     assert make(project) == 0 and capsys.readouterr().err.count("a is odd") == 1
     assert verbs.show_status(project, verbs.Request("set")) == 0 and "a is odd" in capsys.readouterr().out
-    said = logs()
+    output = logs()
     for step, threads in (("upper/a", "1 thread"), ("count/b", "1 thread"), ("total", "2 threads")):
-        assert re.search("^" + step + COST.format(threads), said, re.M), said
-    versions = re.findall(r"^    made with filelock \d.*, Linux \w+, msgspec \d.*, Python 3\.\d.*$", said, re.M)
-    assert len(versions) == 1 and said.count("msgspec") == 1 and "    with " not in said
-    assert "warning: a is odd" in said
+        assert re.search("^" + step + COST.format(threads), output, re.M), output
+    versions = re.findall(r"^    made with filelock \d.*, Linux \w+, msgspec \d.*, Python 3\.\d.*$", output, re.M)
+    assert len(versions) == 1 and output.count("msgspec") == 1 and "    with " not in output
+    assert "warning: a is odd" in output
     texts = [path.read_text() for path in (project.build / "store" / "keys").iterdir()]
     assert not any(word in text for text in texts for word in (f'"{os.uname().nodename}"', str(project.root)))
     steps = [line.split()[0] for line in logs("upper").splitlines() if not line.startswith(" ")]
@@ -205,24 +205,24 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     with pytest.raises(InputError, match=r"no requested step belongs to a photo or recipe 'aa'") as caught:
         logs(photo="aa")
     assert caught.value.key == "PHOTO"
-    said = logs("table", settings=["table.scale=3"])
-    assert re.search(r"^table +to run: parameter scale: default -> 3$", said, re.M)
+    output = logs("table", settings=["table.scale=3"])
+    assert re.search(r"^table +to run: parameter scale: default -> 3$", output, re.M)
 
 
 def test_a_terminal_shows_a_bar_for_each_stage_and_lines_above_them(monkeypatch):
     terminal, steps = io.StringIO(), [Step("upper", "a"), Step("upper", "b")]
     terminal.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", terminal)
-    shown = display.Display()
-    shown.plan([PlannedStep(step, "to run", []) for step in steps])
+    bars = display.Display()
+    bars.plan([PlannedStep(step, "to run", []) for step in steps])
     for step in steps:
-        shown.start(step)
-    shown.progress(steps[0], 1, 2, "half\x1b[31m")
-    shown.report_once("warning: upper/b: odd\x1b[31m")
-    shown.finish(steps[1], 1.0)
-    shown.close()
-    said = terminal.getvalue()
-    assert "warning: upper/b: odd\\x1b[31m" in said and "1/2" in said and "50% half\\x1b[31m" in said
+        bars.start(step)
+    bars.progress(steps[0], 1, 2, "half\x1b[31m")
+    bars.report_once("warning: upper/b: odd\x1b[31m")
+    bars.finish(steps[1], 1.0)
+    bars.close()
+    output = terminal.getvalue()
+    assert "warning: upper/b: odd\\x1b[31m" in output and "1/2" in output and "50% half\\x1b[31m" in output
 
 
 def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alone(project, capsys):
@@ -232,11 +232,11 @@ def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alo
         os.utime(tree, (1_700_000_000, 1_700_000_000))
     capsys.readouterr()
     assert collect(project, lambda: False) == 0
-    said = capsys.readouterr().out
-    assert re.search(r"^table +1 result .* MB   of 2023-11-1\d$", said, re.M) and re.search(
-        "^total +1 result ", said, re.M
+    output = capsys.readouterr().out
+    assert re.search(r"^table +1 result .* MB   of 2023-11-1\d$", output, re.M) and re.search(
+        "^total +1 result ", output, re.M
     )
-    assert "nothing was deleted" in said and state(project, settings=("table.scale=3",))["table"] == "current"
+    assert "nothing was deleted" in output and state(project, settings=("table.scale=3",))["table"] == "current"
     assert collect(project, lambda: True) == 0 and "deleted 2 results" in capsys.readouterr().out
     assert {stage: files_of(project.build / "set" / stage) for stage in before} == before
     assert set(state(project).values()) == {"current"}
@@ -262,13 +262,13 @@ def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsy
     assert wait_until(lambda: sleeping(project))
     verbs.show_status(project, verbs.Request("set"))
     assert re.search(r"^upper +[12] running", capsys.readouterr().out)
-    with pytest.raises(InputError, match="a run is going on"):
+    with pytest.raises(InputError, match="a run is using this store"):
         collect(project)
     second = start(project)
     waits = any("another run is making it" in line for line in second.stdout)
     go.touch()
-    said = second.communicate(timeout=60)[0]
-    assert waits and first.wait(timeout=60) == 0 and second.returncode == 0, said
+    output = second.communicate(timeout=60)[0]
+    assert waits and first.wait(timeout=60) == 0 and second.returncode == 0, output
     first.stdout.close()
     assert sorted(done(project)).count("upper/a") == 2  # once in the fixture, once for both
 

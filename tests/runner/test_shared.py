@@ -30,9 +30,9 @@ def shared(tmp_path, monkeypatch):
 @pytest.fixture
 def one(tmp_path, shared):
     """A checkout that has made everything, and so has the shared store."""
-    made = checkout(tmp_path / "one")
-    assert make(made) == 0 and computed(made) == 6 and not (made.build / "store").exists()
-    return made
+    project = checkout(tmp_path / "one")
+    assert make(project) == 0 and computed(project) == 6 and not (project.build / "store").exists()
+    return project
 
 
 def checkout(folder, **texts):

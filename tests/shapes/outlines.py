@@ -51,8 +51,8 @@ def views_of(mesh, poses, ground, size=320) -> dict[str, PhotoForMotion]:
         maps = rasterise([mesh, plane(-0.6)], camera, [pose, of_ground])
         places, grey = camera.rays() * maps.depth[..., None], np.zeros((size, size))
         for label, own, scale in ((1, pose, 2.0), (2, of_ground, 1.0)):
-            seen = maps.label == label
-            grey[seen] = grained(scale * (places[seen] - own.translation) @ own.rotation)
+            visible = maps.label == label
+            grey[visible] = grained(scale * (places[visible] - own.translation) @ own.rotation)
         pixels = (np.clip(grey, 0, 1) * 255).astype(np.uint8)
         prior = with_prior_focal(camera, None, None)
         views[f"p{number}"] = PhotoForMotion(pixels, maps.label == 1, np.zeros((size, size), bool), *prior)

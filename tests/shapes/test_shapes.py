@@ -39,8 +39,8 @@ def test_a_hull_holds_the_body_and_looks_like_it_in_a_photo_it_was_not_made_of()
     assert holds(hull, BLOB.vertices * 0.97) > 0.99
     assert 1.0 < solid(hull).volume / trimesh.Trimesh(BLOB.vertices, BLOB.faces).volume < 1.06
     new = looking_from(33, 47)
-    seen, own = outline(hull.as_mesh(), new, True).part > 0, outline(BLOB, new, True).part > 0
-    assert (seen & own).sum() / (seen | own).sum() > 0.97
+    visible, own = outline(hull.as_mesh(), new, True).part > 0, outline(BLOB, new, True).part > 0
+    assert (visible & own).sum() / (visible | own).sum() > 0.97
 
 
 @pytest.mark.parametrize("poses, said", [
@@ -127,20 +127,20 @@ def turns_off(found):
 
 def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
     views, shares = views_of(RESTING, POSES, POSES), []
-    found = cameras_by_motion(views, lambda share, what: shares.append(share))
+    result = cameras_by_motion(views, lambda share, what: shares.append(share))
     assert shares == sorted(shares) and len(set(shares)) > 4 * len(views)  # it moves with every photo, twice
-    assert list(found) == list(views) and max(turns_off(found)) < 0.5
-    assert all(each.focal == pytest.approx(1.3 * 320, rel=0.02) for each in found.values())
+    assert list(result) == list(views) and max(turns_off(result)) < 0.5
+    assert all(each.focal == pytest.approx(1.3 * 320, rel=0.02) for each in result.values())
     known = msgspec.structs.replace(views["p0"].camera, focal=430.0)
-    kept = {name: msgspec.structs.replace(view, camera=known, focal_sigma=0.0) for name, view in views.items()}
-    assert {each.focal for each in cameras_by_motion(kept).values()} == {430.0}  # what is given is not moved
+    known_views = {name: msgspec.structs.replace(view, camera=known, focal_sigma=0.0) for name, view in views.items()}
+    assert {each.focal for each in cameras_by_motion(known_views).values()} == {430.0}  # what is given is not moved
     again = cameras_by_motion(views)
-    assert all(np.array_equal(found[n].pose.rotation, again[n].pose.rotation) for n in found)
+    assert all(np.array_equal(result[n].pose.rotation, again[n].pose.rotation) for n in result)
 
 
 def test_of_a_body_that_turns_before_a_camera_at_rest_the_ground_that_stands_still_is_not_believed():
-    found = cameras_by_motion(views_of(RESTING, POSES, [POSES[0]] * len(POSES), 480))
-    assert len(found) >= 3 and max(turns_off(found)) < 3.0
+    result = cameras_by_motion(views_of(RESTING, POSES, [POSES[0]] * len(POSES), 480))
+    assert len(result) >= 3 and max(turns_off(result)) < 3.0
 
 
 def test_a_hull_agrees_with_its_masks_where_cameras_move_with_the_body_alone():

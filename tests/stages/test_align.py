@@ -44,8 +44,8 @@ def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, s
 def run(tmp_path, inputs, name="out", **params):
     out = tmp_path / name
     out.mkdir()
-    align.main(align.Params(search=QUICK, **params), inputs, out, told := Rising())
-    assert told.moves >= 1
+    align.main(align.Params(search=QUICK, **params), inputs, out, progress := Rising())
+    assert progress.moves >= 1
     return out, json.loads((out / "a.json").read_text())
 
 
@@ -190,13 +190,13 @@ def test_keypoints_are_pixels_of_the_photo_before_its_lens_was_undone(tmp_path):
     slice_["objects"][0]["keypoints"] = [
         {"pixel": [x, 2 * x], "point": [x, 0.0, 1.0]} for x in (10.0, 60.0, 80.0, 140.0)
     ]
-    channels, found = read_exr(inputs["masks"] / "a.exr"), []
+    channels, result = read_exr(inputs["masks"] / "a.exr"), []
     for camera in (known, known | {"distortion": None}):
         given = msgspec.convert({**slice_, "camera": camera}, ObjectsSlice)
-        found.append(align.read_objects(given, channels, inputs, align.Params(), 2, None)[0].keypoints.pixel)
-    bent = (found[1] - [100.25, 75.0]) / 300
-    assert np.abs(found[1] - found[0]).max() > 1
-    straight = (found[0] - [100.25, 75.0]) / 300
+        result.append(align.read_objects(given, channels, inputs, align.Params(), 2, None)[0].keypoints.pixel)
+    bent = (result[1] - [100.25, 75.0]) / 300
+    assert np.abs(result[1] - result[0]).max() > 1
+    straight = (result[0] - [100.25, 75.0]) / 300
     np.testing.assert_allclose(straight * (1 + 0.3 * np.square(straight).sum(1, keepdims=True)), bent, atol=1e-9)
 
 

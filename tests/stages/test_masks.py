@@ -44,8 +44,8 @@ def folder(tmp_path):
 def run(folder, params=masks.Params(), **facts):
     """The channels and the summary the stage writes for a photo `kitchen` with the given facts."""
     photo = PhotoSlice(**GIVEN | {"objects": []} | facts)
-    given = {"dataset.photo": msgspec.to_builtins(photo), "dataset.materials": MATERIALS}
-    inputs = Inputs({}, given, {path.name: path for path in (folder / "in").iterdir()}, "kitchen")
+    focal = {"dataset.photo": msgspec.to_builtins(photo), "dataset.materials": MATERIALS}
+    inputs = Inputs({}, focal, {path.name: path for path in (folder / "in").iterdir()}, "kitchen")
     out = folder / "out"
     out.mkdir(exist_ok=True)
     masks.main(params, inputs, out, lambda *_: None)
@@ -101,8 +101,8 @@ def test_focal_of_the_dataset_goes_before_exif_and_is_of_the_photo_as_it_is(fold
     output = oiio.ImageOutput.create("photo.jpg")
     assert output.open(str(folder / "in" / "photo.jpg"), spec) and output.write_image(np.full((H, W, 3), 90, np.uint8))
     output.close()
-    for given, source, expected in ((812.0, "dataset", 812.0), (None, "exif", 50 / np.hypot(36, 24) * np.hypot(W, H))):
-        summary = run(folder, image="photo.jpg", focal_px=given)[1]
+    for facts, source, expected in ((812.0, "dataset", 812.0), (None, "exif", 50 / np.hypot(36, 24) * np.hypot(W, H))):
+        summary = run(folder, image="photo.jpg", focal_px=facts)[1]
         assert summary["focal_source"] == source and summary["focal_px"] == pytest.approx(expected)
     assert run(folder, params=SMALLER, focal_px=812.0)[1]["focal_px"] == 406.0
 

@@ -23,26 +23,26 @@ ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
 
 
 @pytest.fixture
-def made():
+def inputs():
     return made_export.shared()[0]
 
 
-def changed(made, fact, value):
-    return Inputs(made.folders, {**made.facts, fact: value}, made.files)
+def changed(inputs, fact, value):
+    return Inputs(inputs.folders, {**inputs.facts, fact: value}, inputs.files)
 
 
-def drawn(made, out, recipe, **files):
-    facts = {**made.facts, "recipe": msgspec.to_builtins(recipe)}
-    given = {f"recipe file:{name}": path for name, path in files.items()}
+def drawn(inputs, out, recipe, **files):
+    facts = {**inputs.facts, "recipe": msgspec.to_builtins(recipe)}
+    files_by_field = {f"recipe file:{name}": path for name, path in files.items()}
     out.mkdir()
-    recipes.main(recipes.Params(), Inputs(made.folders, facts, {**made.files, **given}), out, silent)
+    recipes.main(recipes.Params(), Inputs(inputs.folders, facts, {**inputs.files, **files_by_field}), out, silent)
     return files_of(out)
 
 
 @pytest.fixture
-def grounded(made):
+def grounded(inputs):
     """The same with a ground in every photo."""
-    return changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
+    return changed(inputs, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
 
 
 GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
@@ -70,9 +70,9 @@ def test_files_of_every_kind_and_the_same_bytes_again(grounded, tmp_path, recipe
 
 
 @pytest.mark.parametrize("photo", made_export.MESHES)
-def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(made, photo):
+def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(inputs, photo):
     """Also where that is fixed to the world: the map of the light with the sun is brightest in the direction that the recipe says."""
-    results, sun = SolvedSet(made), kinds.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
+    results, sun = SolvedSet(inputs), kinds.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
     world = results.lights[photo].world_from_camera
     own = results.scene(photo, sun).light.rotate(YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)))
     directions = lat_long_directions(64, 128).reshape(-1, 3)
@@ -88,64 +88,64 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     assert error.key == "material"
 
 
-def test_the_photo_stays_where_no_object_is(made, tmp_path):
-    drawn(made, tmp_path / "out", kinds.ResynthesisRecipe(photos=["front"], samples=4))
-    masks = read_exr(made["masks"] / "front.exr")
+def test_the_photo_stays_where_no_object_is(inputs, tmp_path):
+    drawn(inputs, tmp_path / "out", kinds.ResynthesisRecipe(photos=["front"], samples=4))
+    masks = read_exr(inputs["masks"] / "front.exr")
     photo = picture(np.stack([masks[c] for c in "RGB"], axis=-1), 1.0)
-    found, empty = read_png(tmp_path / "out" / "front.png"), read_exr(made["align"] / "front.exr")["label"] == 0
+    result, empty = read_png(tmp_path / "out" / "front.png"), read_exr(inputs["align"] / "front.exr")["label"] == 0
     far = ~np.any([np.roll(~empty, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
-    assert np.array_equal(found[far], photo[far]) and not np.array_equal(found[~empty], photo[~empty])
+    assert np.array_equal(result[far], photo[far]) and not np.array_equal(result[~empty], photo[~empty])
 
 
-def own_material(made, tmp_path, material):
+def own_material(inputs, tmp_path, material):
     write_json(tmp_path / "own.json", MaterialTable({"own": attach_errors(material, ERROR)}))
     recipe = kinds.TransferRecipe(photos=["front"], materials={"red": "own"}, table="own.json", samples=4)
-    drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
+    drawn(inputs, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
 
 
-def test_a_material_of_ones_own_is_what_is_drawn(made, tmp_path):
-    own_material(made, tmp_path, Reflectance((0.0,) * 3, (0.0,) * 3, 1.0))
-    inside = read_exr(made["align"] / "front.exr")["confidence"] > 0
+def test_a_material_of_ones_own_is_what_is_drawn(inputs, tmp_path):
+    own_material(inputs, tmp_path, Reflectance((0.0,) * 3, (0.0,) * 3, 1.0))
+    inside = read_exr(inputs["align"] / "front.exr")["confidence"] > 0
     assert (read_exr(tmp_path / "out" / "front.exr")["G"][inside] == 0).mean() > 0.9
 
 
-def test_a_material_that_reflects_more_than_arrives_is_refused(made, tmp_path):
+def test_a_material_that_reflects_more_than_arrives_is_refused(inputs, tmp_path):
     refusal(
-        "more light is reflected than arrives", own_material, made, tmp_path, Reflectance((0.9,) * 3, (0.3,) * 3, 0.5)
+        "more light is reflected than arrives", own_material, inputs, tmp_path, Reflectance((0.9,) * 3, (0.3,) * 3, 0.5)
     )
 
 
-def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
+def test_the_light_of_a_file_is_used_as_it_lies(inputs, tmp_path):
     """Light from +x is a quarter of the map's width from its left edge: the right side of the ball is lit."""
     lat_long = np.full((16, 32, 3), 0.01)
     lat_long[6:10, 7:9] = 50.0
     write_rgb_exr(tmp_path / "lamp.exr", lat_long)
     recipe = kinds.RelightRecipe(photos=["front"], lights=["lamp.exr"], samples=64)
-    drawn(made, tmp_path / "out", recipe, **{"lamp.exr": tmp_path / "lamp.exr"})
+    drawn(inputs, tmp_path / "out", recipe, **{"lamp.exr": tmp_path / "lamp.exr"})
     picture = read_exr(tmp_path / "out" / "front" / "lamp.exr")
     left, right = np.array_split(np.nonzero(picture["A"].max(axis=0))[0], 2)
     assert picture["R"][:, right].sum() > 3 * picture["R"][:, left].sum()
 
 
-def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):
+def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(inputs, tmp_path, caplog):
     nothing = {"camera": {}, "objects": [], "meshes": {}}
-    some = changed(made, "dataset.objects", {**made.facts["dataset.objects"], "front": nothing})
+    some = changed(inputs, "dataset.objects", {**inputs.facts["dataset.objects"], "front": nothing})
     refusal(
         "'front' has no objects to render", drawn, some, tmp_path / "named", kinds.ResynthesisRecipe(photos=["front"])
     )
     assert sorted(drawn(some, tmp_path / "out", kinds.ResynthesisRecipe(samples=1))) == PICTURES["side"]
     assert "front: no picture of this photo" in caplog.text
-    none = changed(made, "dataset.objects", dict.fromkeys(made_export.MESHES, nothing))
+    none = changed(inputs, "dataset.objects", dict.fromkeys(made_export.MESHES, nothing))
     refusal("no objects", drawn, none, tmp_path / "none", kinds.ResynthesisRecipe())
 
 
-def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
+def test_nothing_is_put_on_a_ground_that_is_seen_from_below(inputs, tmp_path):
     above = {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}}  # y is down
-    below = {**made.facts["dataset.ground"], "front": above}
+    below = {**inputs.facts["dataset.ground"], "front": above}
     refusal(
         "'front' was taken from below",
         drawn,
-        changed(made, "dataset.ground", below),
+        changed(inputs, "dataset.ground", below),
         tmp_path / "out",
         kinds.InsertRecipe(photos=["front"], samples=1),
     )

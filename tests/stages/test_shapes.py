@@ -37,8 +37,8 @@ def test_photos_and_masks_of_a_body_at_rest_give_cameras_a_hull_and_normals(tmp_
         obj = entry["objects"]["thing"]
         assert (entry["camera"]["focal_source"], obj["source"], obj["doubts"]) == ("sfm", "sfm", [])
         assert entry["camera"]["focal_px"] == pytest.approx(1.3 * 320, rel=0.03) and obj["silhouette_iou"] > 0.96
-        found = read_exr(tmp_path / "out" / "align" / f"p{number}.exr")
+        result = read_exr(tmp_path / "out" / "align" / f"p{number}.exr")
         true = rasterise(body, Camera(320, 320, 1.3 * 320, (160.0, 160.0)), AROUND[number])
-        both = (true.label > 0) & (found["label"] > 0)
-        normal = np.stack([found[f"normal.{a}"] for a in "xyz"], axis=-1)
+        both = (true.label > 0) & (result["label"] > 0)
+        normal = np.stack([result[f"normal.{a}"] for a in "xyz"], axis=-1)
         assert np.median(np.rad2deg(np.arccos(np.clip(np.sum(normal * true.normal, axis=-1)[both], -1, 1)))) < 12

@@ -53,8 +53,8 @@ def run(folder, photos, progress=silent, unfinished=None, start=None, light=None
     quick = {"merge_degrees": 0.0}
     if params.get("solver") != "paper":
         quick |= {"cells": 24, "splittings": 0, "observations": 150, "tone": "off"}
-    solve.main(solve.Params(**{**quick, **params}), inputs, out, told := progress or Rising())
-    assert progress or "solver" in params or told.share > 0.9
+    solve.main(solve.Params(**{**quick, **params}), inputs, out, reports := progress or Rising())
+    assert progress or "solver" in params or reports.share > 0.9
     return out
 
 
@@ -81,13 +81,13 @@ def solved(tmp_path_factory, linked):
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory, linked):
     """A solution of the first photo alone, and what was said of it."""
-    said = []
+    messages = []
     handler = logging.Handler()
-    handler.emit = lambda record: said.append(record.getMessage())
+    handler.emit = lambda record: messages.append(record.getMessage())
     logging.getLogger().addHandler(handler)
     out = run(tmp_path_factory.mktemp("earlier"), {"a": linked["a"]})
     logging.getLogger().removeHandler(handler)
-    return out, "\n".join(said)
+    return out, "\n".join(messages)
 
 
 def test_writes_the_fixed_artifacts(solved):
@@ -232,9 +232,9 @@ def test_a_known_map_ball_and_exposures_are_held(tmp_path, linked, caplog):
     }  # fmt: skip
     lights = {k: {"illumination": "b" if k == "c" else k, "world_from_camera": None} for k in photos}
     out = run(tmp_path, photos, light=lights, known=known, files={"b.exr": tmp_path / "b.exr"}, splittings=1)
-    found = read_lobes(out / "lobes.parquet")
-    np.testing.assert_allclose(found["a"].energy, light.energy, rtol=0.05)
-    shares = [one / one.sum() for one in (found["b"].energy, random_lobes(2).energy)]
+    result = read_lobes(out / "lobes.parquet")
+    np.testing.assert_allclose(result["a"].energy, light.energy, rtol=0.05)
+    shares = [one / one.sum() for one in (result["b"].energy, random_lobes(2).energy)]
     np.testing.assert_allclose(*shares, rtol=1e-3)
     assert read_json(out / "exposures.json")["c"] == [0.25] * 3
     solved = table(out)

@@ -45,11 +45,11 @@ def written(folder) -> None:
 
 def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tmp_path):
     written(tmp_path / "surface")
-    seen = with_surface_normals(observations(), tmp_path / "surface")
-    first = seen.y == 0
-    np.testing.assert_allclose(seen.normal[~first], np.tile([0.6, 0, -0.8], ((~first).sum(), 1)), atol=1e-6)
-    assert (seen.normal[first] == [0, 0, -1]).all() and (seen.detail[first] == 1).all()
-    assert (seen.detail[~first & (seen.x < 6)] == 0.5).all() and (seen.detail[seen.x >= 6] == 1).all()
+    observed = with_surface_normals(observations(), tmp_path / "surface")
+    first = observed.y == 0
+    np.testing.assert_allclose(observed.normal[~first], np.tile([0.6, 0, -0.8], ((~first).sum(), 1)), atol=1e-6)
+    assert (observed.normal[first] == [0, 0, -1]).all() and (observed.detail[first] == 1).all()
+    assert (observed.detail[~first & (observed.x < 6)] == 0.5).all() and (observed.detail[observed.x >= 6] == 1).all()
     (tmp_path / "align").mkdir()
     write_exr(
         tmp_path / "align" / "a.exr",

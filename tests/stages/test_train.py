@@ -72,6 +72,6 @@ def test_shipped_weights_are_of_this_stage_and_within_the_bounds(tmp_path):
     assert accuracy["specular"]["samples"] == train.Params().held_out
     assert accuracy["specular"]["median"] < 0.003 and accuracy["specular"]["p95"] < 0.02
     assert accuracy["diffuse"]["p95"] < 0.005
-    seen = read_state(project(), Request("eames", ["train"]))
-    shipping = seen.spec.pipeline.stages["train"].shipped
-    assert copy_shipped([LIBRARY], shipping, seen.plan()[0].record, tmp_path / "out")
+    state = read_state(project(), Request("eames", ["train"]))
+    shipping = state.spec.pipeline.stages["train"].shipped
+    assert copy_shipped([LIBRARY], shipping, state.plan()[0].record, tmp_path / "out")

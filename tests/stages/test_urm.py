@@ -77,17 +77,17 @@ def test_one_ball_sees_everything_and_its_file_says_nothing_of_visibility(tmp_pa
 
 
 def test_two_balls_hide_each_other_where_they_face_in_the_same_bytes_again(tmp_path, two, whole):
-    seen = read_observations(whole)
-    hidden, left = (seen.visibility < 255).mean(1), seen.x < 40
-    assert seen.visibility.shape[1] == urm.Params().directions
-    assert hidden[left & (seen.normal[:, 0] > 0.6)].min() > hidden[left & (seen.normal[:, 0] < -0.2)].max()
-    assert (hidden[~left & (seen.normal[:, 0] > 0.2)] == 0).all()
+    observed = read_observations(whole)
+    hidden, left = (observed.visibility < 255).mean(1), observed.x < 40
+    assert observed.visibility.shape[1] == urm.Params().directions
+    assert hidden[left & (observed.normal[:, 0] > 0.6)].min() > hidden[left & (observed.normal[:, 0] < -0.2)].max()
+    assert (hidden[~left & (observed.normal[:, 0] > 0.2)] == 0).all()
     assert run(tmp_path / "again", two).read_bytes() == whole.read_bytes()
 
 
 def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_path, two, whole, monkeypatch):
     whole = read_observations(whole)
-    monkeypatch.setattr(urm, "sample", lambda seen, most: sample(seen, 600))
+    monkeypatch.setattr(urm, "sample", lambda observed, most: sample(observed, 600))
     part = read_observations(run(tmp_path / "part", two))
     assert len(whole) > 1000 > len(part) == 600
     assert part.weight.sum() == pytest.approx(whole.weight.sum(), rel=1e-5) == pytest.approx(len(whole), rel=1e-5)

@@ -95,11 +95,11 @@ def scored(case, factors, roughness=0.0):
 
 @CASES
 def test_the_truth_in_any_gauge_scores_nothing(case):
-    found = scored(case, FACTORS)
+    result = scored(case, FACTORS)
     parts = {"entries", "observed", "unobserved", "new_light", "first_light"}
     parts |= {"first_material"} if 0 in case.materials else set()
-    assert parts <= found.values.keys() and max(found.values[p] for p in (*parts, "diffuse", "mirror")) < 1e-5
-    assert found.values["stated_roughness"] == pytest.approx(0.02) and "tint" not in found.values
+    assert parts <= result.values.keys() and max(result.values[p] for p in (*parts, "diffuse", "mirror")) < 1e-5
+    assert result.values["stated_roughness"] == pytest.approx(0.02) and "tint" not in result.values
     assert (
-        min(found.nulls[p] for p in ("entries", "new_light")) > 1e-3
+        min(result.nulls[p] for p in ("entries", "new_light")) > 1e-3
     )  # of constant lights, as these, all else is right

@@ -32,10 +32,10 @@ def drawn(prior: LightPrior, cells, count: int, seed: int = 0):
 
 def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
     cells = fibonacci_sphere(100)
-    found = fit_prior(drawn(KNOWN, cells, 150), cells)
+    result = fit_prior(drawn(KNOWN, cells, 150), cells)
     for name, rtol in (("variance", 0.25), ("decay_deg", 0.25), ("nugget", 0.3), ("level", 0.5), ("freedom", 0.4)):
-        np.testing.assert_allclose(getattr(found, name), getattr(KNOWN, name), rtol=rtol)
-    np.testing.assert_allclose(found.profile, KNOWN.profile, atol=0.15)
+        np.testing.assert_allclose(getattr(result, name), getattr(KNOWN, name), rtol=rtol)
+    np.testing.assert_allclose(result.profile, KNOWN.profile, atol=0.15)
 
 
 def test_the_gradient_is_the_finite_difference():

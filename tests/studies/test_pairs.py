@@ -57,7 +57,7 @@ def test_nothing_below_the_floor_is_told_apart():
     truth = photo.copy()
     truth[body], truth[25:35, 10:30] = 0.2, 0.15
     parts = dict.fromkeys(scene.FACTORS, truth)
-    for mine, its, told in ((1.3, 1.0, True), (2.0, 1.0, False), (1.3, 1.5, False)):
+    for mine, its, progress in ((1.3, 1.0, True), (2.0, 1.0, False), (1.3, 1.5, False)):
         of = scene.score(scene.Pair(1.3 * truth, truth), scene.Pair(mine * truth, its * truth), parts, photo, body)
-        assert of["told_apart"] == told
+        assert of["told_apart"] == progress
     assert scene.cielab(np.full((3, 3, 3), [1.0, 0, 0]))[1, 1] == pytest.approx([53.24, 80.09, 67.20], abs=0.05)

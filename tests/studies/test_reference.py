@@ -28,8 +28,8 @@ def test_every_number_of_a_small_run_is_as_stored_stage_by_stage(tmp_path):
 def test_every_number_is_as_stored_and_every_bound_holds():
     command = [sys.executable, "-m", "factorlib", "all", "--dataset", "synthetic"]
     environment = {k: v for k, v in os.environ.items() if k not in ("DATASET", "FACTORLIB_ROOT")}
-    done = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
+    process = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True)
+    assert process.returncode == 0, f"{' '.join(command)}\n{process.stdout}\n{process.stderr}"
     metrics = read_json(LIBRARY / "build" / "synthetic" / "evaluate" / "metrics.json")
     moved = differences(metric_numbers(metrics), read_stored())
     assert not moved, complaint(moved)

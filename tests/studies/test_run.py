@@ -31,8 +31,8 @@ NAME = "matrix-size"
 )
 def test_wrong_names_and_words_are_answered(words, environment, said):
     command, environment = [sys.executable, "-m", "studies", *words], {**os.environ, **environment}
-    done = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and said in done.stderr and "Traceback" not in done.stderr
+    process = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 1 and said in process.stderr and "Traceback" not in process.stderr
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
         refuse.refuse_if(
             not (0 < length <= LARGEST and max(abs(x), abs(y), abs(z)) <= LARGEST and not math.isnan(x + y + z)),
             key,
-            "is no pose: its numbers are zero, not finite or too large",
+            "is not a pose: its numbers are zero, not finite or too large",
             DAMAGED,
         )
         unit = [value / length for value in (*quaternion[1:], quaternion[0])]
@@ -77,7 +77,7 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
 def _parameter_count(model: str) -> int:
     """Return the number of parameters of a camera model."""
     if model not in MODELS.values():
-        raise ValueError(f"{one_line(model)!r} is no camera model")
+        raise ValueError(f"{one_line(model)!r} is not a camera model")
     return len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
 
 
@@ -97,7 +97,7 @@ def _records(file: Path, record: Callable[[mmap.mmap, int], tuple[Line, int]]) -
 def _binary_camera(content: mmap.mmap, offset: int) -> tuple[CameraLine, int]:
     number, model, width, height = struct.unpack_from("<IiQQ", content, offset)
     if model not in MODELS:
-        raise ValueError(f"{model} is no camera model")
+        raise ValueError(f"{model} is not the number of a camera model")
     count = _parameter_count(MODELS[model])
     params = struct.unpack_from(f"<{count}d", content, offset + 24)
     return (number, MODELS[model], width, height, params), offset + 24 + 8 * count
@@ -108,7 +108,7 @@ def _binary_image(content: mmap.mmap, offset: int) -> tuple[ImageLine, int]:
     _, *pose, camera_id = struct.unpack_from("<I7dI", content, offset)
     end = content.find(b"\0", offset + 64, offset + 64 + MOST_NAME)
     if end < 0:
-        raise ValueError("the name of an image does not end")
+        raise ValueError("the name of an image does not end with a zero byte")
     (points,) = struct.unpack_from("<Q", content, end + 1)
     next_offset = end + 9 + points * struct.calcsize("<2dQ")
     if next_offset > len(content):
@@ -129,7 +129,7 @@ def _text_images(file: Path) -> Iterator[ImageLine]:
         for line in filter(_has_content, lines):
             words = line.strip().split(maxsplit=9)
             if len(words) != 10:
-                raise ValueError(f"{one_line(line)!r} is no line of an image: it has {len(words)} words of 10")
+                raise ValueError(f"{one_line(line)!r} has {len(words)} words; the line of an image has 10")
             next(lines, None)
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 

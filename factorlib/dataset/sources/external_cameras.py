@@ -33,10 +33,10 @@ log = logging.getLogger("factorlib.dataset")
 
 
 def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[str, ExternalCamera]]:
-    """Return the dataset and the cameras of its photos in the source.
+    """Read the cameras of a dataset's photos from its external source, the key `cameras` of dataset.yaml.
 
-    The dataset gets world_from_camera from the source if `cameras` asks for it.  A warning names photos that the source
-    lacks.
+    `file` is the path of dataset.yaml.  The cameras are returned by photo, and the dataset with world_from_camera of
+    the source if `cameras` asks for it.  A warning names photos that the source lacks.
 
     Raises:
         InputError: The source cannot be read, a photo matches several of its images, or a camera is not a pinhole.

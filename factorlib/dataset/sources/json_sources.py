@@ -115,7 +115,7 @@ def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Came
         refuse.refuse_if(
             not FOCAL_PX[0] <= focal <= FOCAL_PX[1],
             f"{key}.camera_angle_x",
-            f"an angle of {angle:g} is no field of view",
+            f"an angle of {angle:g} is not a field of view",
             "give it in radians, more than 0 and less than π",
         )
         if lens.w is None:

@@ -74,7 +74,7 @@ def colmap_camera(
         params: parameters of the model
         refuse: raises errors
     """
-    fault = f"is no camera: {width:g}×{height:g} pixels, {model} {', '.join(f'{x:g}' for x in params)}"
+    fault = f"is not a camera: {width:g}×{height:g} pixels, {model} {', '.join(f'{x:g}' for x in params)}"
     refuse.refuse_if(
         not (1 <= width <= SIDE_PX and 1 <= height <= SIDE_PX),
         key,
@@ -97,9 +97,9 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
     focals = camera.focal_length_x, camera.focal_length_y
     if not (min(camera.width, camera.height, *focals) > 0 and math.isfinite(sum(camera.params))):
         size = f"{camera.width}×{camera.height} pixels"
-        refuse(key, f"is no camera: {size}, {camera.model_name} {camera.params_to_string()}", DAMAGED)
+        refuse(key, f"is not a camera: {size}, {camera.model_name} {camera.params_to_string()}", DAMAGED)
     if not (all(FOCAL_PX[0] <= f <= FOCAL_PX[1] for f in focals) and max(map(abs, centre)) <= CENTRE_PX):
-        fault = f"a focal length of {focals[0]:g} px about ({centre[0]:g}, {centre[1]:g}) is no photo's"
+        fault = f"its focal length {focals[0]:g} px or principal point ({centre[0]:g}, {centre[1]:g}) is implausible"
         cure = f"focal lengths are {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, principal points up to {CENTRE_PX:g} px away"
         refuse(key, fault, f"{cure}; {DAMAGED}")
     if camera.is_undistorted() and focals[0] == focals[1]:
