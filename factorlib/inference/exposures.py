@@ -26,23 +26,19 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.known import KnownValues
 from factorlib.inference.likelihood import EXPOSURE_DEVIATION, LightLikelihood
-from factorlib.inference.material_prior import MaterialPrior, materials_from_unknowns
+from factorlib.inference.material_prior import materials_from_unknowns
 from factorlib.inference.materials import Materials
+from factorlib.inference.optimizer import Descent, DescentState
 
 
-def balance_exposures(
-    theta: Float[np.ndarray, "m 7"], likelihoods: Sequence[LightLikelihood], prior: MaterialPrior, known: KnownValues
-) -> tuple[Float[np.ndarray, "m 7"], list[LightLikelihood]]:
-    """Return material unknowns and lights after the move (1) that the priors favour.
+def balance_exposures(state: DescentState, descent: Descent, known: KnownValues) -> DescentState:
+    """Return the state after the move (1) that the priors favour.
 
     Components with known materials or lights, and those of one group, stay as they are.
-
-    Args:
-        theta: log k_d, log k_s and roughness.
-        likelihoods: Likelihood of each light.
-        prior: Prior on materials.
-        known: Known values.
     """
+    theta = state.theta
+    likelihoods = state.likelihoods
+    prior = descent.prior
     blocks = [likelihood.illumination.block for likelihood in likelihoods]
     group = material_groups(blocks, len(theta), known)
     movable = np.zeros(len(theta), bool)
@@ -51,7 +47,7 @@ def balance_exposures(
         movable[rows] = len(set(group[rows])) > 1 and known.free_factors(members, lights) == 3
     moving = np.unique(group[movable])
     if not len(moving):
-        return theta, list(likelihoods)
+        return state
     terms = [LightTerms(likelihood, group) for likelihood in likelihoods]
 
     def move(logs: Float[np.ndarray, " g"]) -> tuple[Float[np.ndarray, "m 7"], Float[np.ndarray, " m"]]:
@@ -69,7 +65,7 @@ def balance_exposures(
 
     moved, log_factors = move(minimize(energy, np.zeros(len(moving))).x)
     materials = materials_from_unknowns(moved)
-    return moved, [term.moved(log_factors, materials) for term in terms]
+    return descent.linearise([term.moved(log_factors, materials) for term in terms], moved)
 
 
 class LightTerms:

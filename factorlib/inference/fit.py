@@ -147,8 +147,8 @@ def fit_problem(
         if schedule.materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
-            theta, balanced = balance_exposures(state.theta, state.likelihoods, prior_on_materials, problem.known)
-            state = descent.descend_jointly(state._replace(theta=theta, likelihoods=balanced), iterations)
+            state = descent.descend_jointly(balance_exposures(state, descent, problem.known), iterations)
+            state = balance_exposures(state, descent, problem.known)
     if not schedule.materials_fixed:
         materials = materials_from_unknowns(state.theta)
     lights = [descended.light for descended in state.likelihoods]

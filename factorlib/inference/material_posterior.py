@@ -21,9 +21,11 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
 from factorlib.inference.material_prior import Mixture, shipped_classes
-from factorlib.inference.materials import ROUGHNESS
+from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 
-BOUNDS = [(None, None)] * 6 + [ROUGHNESS]
+BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
+# Largest standard deviation of a log reflectance in Σ: that of a reflectance near 0, which is known well, is infinite.
+LARGEST_DEVIATION = 2.0
 
 
 class MaterialPosterior(NamedTuple):
@@ -51,11 +53,14 @@ def material_posterior(
         free: Mask of the unknowns that are not known.
     """
     deviation = np.where(free, np.sqrt(np.diag(covariance)), 0.0)
+    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(deviation, 1e-300))
+    covariance = covariance * np.outer(scale, scale)
+    deviation = deviation * scale
     if not free[3:].any():
         return MaterialPosterior(theta, deviation, np.zeros(7))
     mixture = Mixture(shipped_classes().classes)
     precision = np.linalg.inv(covariance[np.ix_(free, free)])
-    bounds = [bound for bound, is_free in zip(BOUNDS, free, strict=True) if is_free]
+    bounds = [(low, max(high, at)) for (low, high), at, is_free in zip(BOUNDS, theta, free, strict=True) if is_free]
 
     def objective(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
         """Return (1) and its gradient by the free unknowns."""

@@ -14,7 +14,7 @@ from factorlib.inference.forward import Illumination
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.light.lobes import Lobes
+from factorlib.light.lobes import Lobes, lobe_energy
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobe_table import read_lobes
@@ -245,3 +245,34 @@ def test_a_known_map_ball_and_exposures_are_held(tmp_path, linked, caplog):
     assert "'blue'" not in caplog.text
     small, fewer = {k: known[k] for k in ("balls", "materials")}, photos | {"a": observations("a", [0, 2], 1)}
     refusal("shows 192 pixels of the ball", run, tmp_path / "small", fewer, light=lights, known=small)
+
+
+def test_a_held_out_photo_changes_no_answer_and_is_predicted(tmp_path, linked, solved):
+    same_light = msgspec.structs.replace(observations("c", [0], 1), illuminations=("a",))
+    own_light = observations("d", [1], 7)
+    photos = linked | {"c": same_light, "d": own_light}
+    light = {name: {"illumination": name, "world_from_camera": None} for name in linked}
+    light |= {"c": {"illumination": "a", "world_from_camera": None, "held_out": True}}
+    light |= {"d": {"illumination": "d", "world_from_camera": None, "held_out": True}}
+    out = run(tmp_path, photos, light=light)
+    for name in ("materials.json", "uncertainty.json", "convergence.parquet"):
+        assert (out / name).read_bytes() == (solved / name).read_bytes()
+    lobes, before = read_lobes(out / "lobes.parquet"), read_lobes(solved / "lobes.parquet")
+    assert set(lobes) == {"a", "b", "d"} and (lobes["a"].weight == before["a"].weight).all()
+    assert read_json(out / "exposures.json") == {name: [1.0] * 3 for name in "abcd"}
+    # the light of its own explains the photo
+    energy, true = (
+        (lobe.weight * lobe_energy(lobe.sharpness)[:, None]).sum(0) for lobe in (lobes["d"], random_lobes(7))
+    )
+    material = table(out)["materials"]["green"]
+    reflectance = np.add(material["diffuse"], material["specular"]) / (MATERIALS.diffuse + MATERIALS.specular)[1]
+    np.testing.assert_allclose(energy * reflectance / true, 1, atol=0.25)
+
+
+def test_exposures_of_held_out_photos_follow_exif(tmp_path, linked):
+    a, b = (msgspec.structs.replace(part, exposures=(1.0,)) for part in linked.values())
+    c = msgspec.structs.replace(observations("c", [0], 1), illuminations=("a",), exposures=(4.0,))
+    light = {name: {"illumination": name, "world_from_camera": None} for name in linked}
+    light |= {"c": {"illumination": "a", "world_from_camera": None, "held_out": True}}
+    out = run(tmp_path, {"a": a, "b": b, "c": c}, light=light)
+    assert read_json(out / "exposures.json")["c"] == [4.0] * 3

@@ -1,0 +1,111 @@
+"""Laws of the balance of exposures: the same radiance, lower priors, and nothing where relative brightness is observed."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.inference.exposures import balance_exposures, material_groups
+from factorlib.inference.fit import fit_problem
+from factorlib.inference.identifiability import before_solving
+from factorlib.inference.known import KnownValues
+from factorlib.inference.material_prior import MaterialPrior, material_unknowns
+from factorlib.inference.materials import Materials, Point
+from factorlib.inference.optimizer import Descent
+from factorlib.inference.problem import JointProblem
+from tests.inference.made_lights import (
+    MATERIALS,
+    OPERATOR,
+    PRIOR,
+    WHOLE,
+    begun,
+    drawn,
+    light_likelihood,
+    on_even_cells,
+    spheres,
+)
+
+CELLS = 60
+
+
+def lamps(log_exposure: float = 0.0) -> JointProblem:
+    """Two lights, each with one photo of the first and one of the second material; exposures of the latter are given."""
+    blocks = []
+    for k in range(2):
+        light = on_even_cells(drawn(40 + k, CELLS), (0.0, log_exposure), name=f"room{k}")
+        one, other = (spheres([light], shown=(m,), size=14).blocks[0] for m in (0, 1))
+        joined = {
+            name: np.concatenate([getattr(one, name), getattr(other, name)])
+            for name in ("normal", "view", "clipped", "material", "held_out")
+        }
+        radiance = np.concatenate([one.radiance * one.unit, other.radiance * other.unit * np.exp(log_exposure)])
+        photo = np.repeat([0, 1], [len(one), len(other)])
+        precision = one.noise.precision(radiance, np.ones(len(radiance)))
+        blocks.append(
+            msgspec.structs.replace(
+                one,
+                name=f"room{k}",
+                photos=("a", "b"),
+                unit=1.0,
+                radiance=radiance,
+                precision=precision,
+                photo=photo,
+                **joined,
+            )
+        )
+    return JointProblem(blocks, OPERATOR)
+
+
+def state_of(problem: JointProblem, exposures=(0.0, 0.0), factor: float = 1.0):
+    """The state at the true materials, the second one times a factor, in drawn lights whose second photo has an exposure."""
+    rows = MATERIALS.rows()
+    rows[1, :6] *= factor
+    materials = Materials.from_rows(rows)
+    lights = [on_even_cells(drawn(40 + k, CELLS), (0.0, e), name=f"room{k}") for k, e in enumerate(exposures)]
+    pairs = [
+        light_likelihood(one, h, PRIOR)
+        for one, h in zip(problem.illuminations(Point(materials, lights)), begun(problem).hyperparameters)
+    ]
+    descent = Descent(MaterialPrior(materials, problem.blocks), problem.spread, lambda loss: None, np.ones(21, bool))
+    return descent.linearise(pairs, material_unknowns(materials)), descent
+
+
+def test_a_balance_predicts_the_same_radiance_and_lowers_the_objective():
+    before, descent = state_of(lamps(), (1.2, 0.9), factor=0.3)
+    after = balance_exposures(before, descent, KnownValues())
+    for old, new in zip(before.likelihoods, after.likelihoods, strict=True):
+        np.testing.assert_allclose(new.illumination.radiance(), old.illumination.radiance(), rtol=1e-6)
+        assert abs(new.light.log_exposure[1]) < old.light.log_exposure[1] - 0.1 and new.light.log_exposure[0] == 0
+    assert after.value < before.value - 1
+    again = balance_exposures(after, descent, KnownValues())
+    np.testing.assert_allclose(again.theta, after.theta, atol=1e-3)
+
+
+def test_materials_of_one_photo_or_of_known_exposures_are_one_group_and_stay():
+    problem = spheres([on_even_cells(drawn(1, CELLS))])
+    assert len(set(material_groups(problem.blocks, 3, KnownValues()))) == 1
+    apart = lamps()
+    assert len(set(material_groups(apart.blocks, 2, KnownValues()))) == 2
+    known = KnownValues(exposures=("room0",))
+    assert len(set(material_groups(apart.blocks, 2, known))) == 1
+    state, descent = state_of(apart, (1.2, 0.9), factor=0.3)
+    assert balance_exposures(state, descent, known) is state
+    given = KnownValues(materials={0: MATERIALS.rows()[0]})
+    assert balance_exposures(state, descent, given) is state
+
+
+def test_a_fit_finds_equal_exposures_where_photos_of_a_light_show_one_material_each():
+    problem = lamps()
+    fit = fit_problem(problem, begun(problem, CELLS), PRIOR, WHOLE)
+    for light in fit.point.lights:
+        assert light.log_exposure[1] == pytest.approx(0, abs=0.5)
+    ratio = fit.point.materials.diffuse[1] / fit.point.materials.diffuse[0]
+    assert np.abs(np.log(ratio / (MATERIALS.diffuse[1] / MATERIALS.diffuse[0])).mean()) < 0.5
+
+
+def test_a_solve_says_that_exposures_and_reflectances_look_alike():
+    sentences = before_solving(["red", "white", "black"], ["a", "b"], lamps())
+    assert any("brightness of red; white" in sentence and "known: {exposure" in sentence for sentence in sentences)
+    known = msgspec.structs.replace(lamps(), known=KnownValues(exposures=("room0", "room1")))
+    assert not any(
+        "brightness of" in sentence for sentence in before_solving(["red", "white", "black"], ["a", "b"], known)
+    )

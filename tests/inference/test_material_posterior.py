@@ -1,0 +1,69 @@
+"""Laws of the posterior of a material: observations decide where they are exact, the prior where they are silent."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from factorlib.inference.material_posterior import BOUNDS, material_posterior
+from factorlib.inference.material_prior import Mixture, shipped_classes
+
+ENAMEL = np.array([*np.log([0.3, 0.2, 0.1]), *np.log([0.2, 0.2, 0.2]), 0.12])
+ALL = np.ones(7, bool)
+CLASSES = Mixture(shipped_classes().classes)
+
+
+def covariance(deviation, correlation: float = 0.0) -> np.ndarray:
+    """Equal correlation of k_d and k_s in each channel, and no other."""
+    deviations = np.broadcast_to(deviation, 7)
+    result = np.diag(deviations**2)
+    for c in range(3):
+        result[c, c + 3] = result[c + 3, c] = correlation * deviations[c] * deviations[c + 3]
+    return result
+
+
+def test_exact_observations_decide():
+    posterior = material_posterior(ENAMEL, covariance(1e-3), ALL)
+    np.testing.assert_allclose(posterior.theta, ENAMEL, atol=1e-4)
+    assert (posterior.prior_share < 1e-3).all()
+    np.testing.assert_allclose(posterior.deviation, 1e-3, rtol=1e-3)
+
+
+def test_where_observations_are_silent_the_material_is_a_likely_one():
+    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [30.0] * 3 + [10.0]), ALL)
+    modes = [minimize(lambda x: CLASSES.evaluate(x)[0], mean, tol=1e-10).fun for mean in CLASSES.mean]
+    assert CLASSES.evaluate(posterior.theta[3:])[0] == pytest.approx(min(modes), abs=1.0)
+    assert (posterior.prior_share[3:] > 0.8).all() and (posterior.prior_share[:3] < 0.01).all()
+    np.testing.assert_allclose(posterior.theta[:3], ENAMEL[:3], atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_point_of_a_search_has_less_energy(seed):
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(7, 7)) * np.array([0.3] * 6 + [0.1])[:, None]
+    sigma = root @ root.T + np.diag([0.01] * 7)
+    posterior = material_posterior(ENAMEL, sigma, ALL)
+    precision = np.linalg.inv(sigma)
+
+    def energy(x: np.ndarray) -> float:
+        return (x - ENAMEL) @ precision @ (x - ENAMEL) + CLASSES.evaluate(x[3:])[0]
+
+    low, high = BOUNDS[6]
+    starts = np.column_stack([random.normal(ENAMEL[:6], 1.0, (20, 6)), random.uniform(low, high, 20)])
+    least = min(minimize(energy, start, bounds=BOUNDS).fun for start in starts)
+    assert energy(posterior.theta) <= least + 1e-4
+    assert low <= posterior.theta[6] <= high
+
+
+def test_the_diffuse_part_takes_what_the_specular_part_loses():
+    posterior = material_posterior(ENAMEL, covariance([0.3] * 3 + [1.0] * 3 + [0.3], correlation=-0.9), ALL)
+    assert (posterior.theta[3:6] < ENAMEL[3:6] - 0.2).all() and (posterior.theta[:3] > ENAMEL[:3] + 0.05).all()
+
+
+def test_known_unknowns_stay():
+    free = np.array([True] * 3 + [False] * 4)
+    posterior = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.2), 0.0), free)
+    np.testing.assert_array_equal(posterior.theta, ENAMEL)
+    assert (posterior.deviation[3:] == 0).all() and (posterior.prior_share == 0).all()
+    free[3:] = [True] * 3 + [False]
+    partly = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.5), 0.0), free)
+    assert partly.theta[6] == ENAMEL[6] and partly.deviation[6] == 0 and (partly.theta[3:6] != ENAMEL[3:6]).any()
