@@ -244,6 +244,15 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
     assert sorted(folder.parent.rglob("*")) == sorted([*before, folder / "dataset.yaml"]), "something was written"
 
 
+def test_a_set_with_every_photo_held_out_is_refused(folder):
+    spec = copy.deepcopy(SPEC)
+    spec["photos"][0]["held_out"] = True
+    assert read_dataset(write(folder, spec)).spec.photos[0].held_out
+    for photo in spec["photos"]:
+        photo["held_out"] = True
+    assert refusal("none is left to solve from", read_dataset, write(folder, spec)).key == "photos"
+
+
 def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(folder):
     spec = copy.deepcopy(SPEC)
     spec["photos"][2] |= {"illumination": "kitchen"}

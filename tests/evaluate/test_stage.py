@@ -56,6 +56,19 @@ def test_every_part_is_scored_beside_its_null_in_finite_numbers(linked):
     assert linked["poses"]["dusk"]["balls"]["rotation_deg"] == pytest.approx(0)
 
 
+def test_a_held_out_photo_is_scored_apart(tmp_path, linked):
+    inputs = make_artifacts(Made(tmp_path / "in", seen=LINKED))
+    inputs.facts["dataset.light"]["dusk"]["held_out"] = True
+    result = evaluated(inputs, tmp_path / "out")
+    assert set(result["resynthesis"]["photos"]) == {"day", "noon"} and linked["held_out"] is None
+    assert set(result["held_out"]["photos"]) == {"dusk"}
+    assert (
+        result["held_out"]["photos"]["dusk"]["gauges"]["none"]
+        == linked["resynthesis"]["photos"]["dusk"]["gauges"]["none"]
+    )
+    assert set(msgspec.convert(result, Metrics).photos) == {"day", "noon", "dusk"}
+
+
 def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
     result = metrics_of(tmp_path, seen={"only": ["red"]}, truth=False)
     assert result["materials"] is result["light"] is result["relighting"] is result["relit_set"] is None
