@@ -52,9 +52,9 @@ from factorlib.inference.materials import Materials
 from factorlib.light.prior import LightPrior
 
 HESSIAN_STRIDE = 8  # one row in so many enters the Hessian of the determinant
-# Standard deviation of a log exposure: less than a stop, relative to EXIF where a photo has it.  Where every photo of a
+# Standard deviation of a log exposure: half a stop, relative to EXIF where a photo has it.  Where every photo of a
 # light shows one material, observations do not distinguish exposure from reflectance, and this prior decides.
-EXPOSURE_DEVIATION = 0.5
+EXPOSURE_DEVIATION = 0.35
 TONE_DEVIATION = 0.3  # standard deviation of a log tone exponent
 
 
