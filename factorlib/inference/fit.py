@@ -42,6 +42,9 @@ from factorlib.light.prior import LightPrior
 RELIABLE = 0.6  # least confidence of a normal, as a share of its material's median
 DARK_NOISE = 0.2  # factor on the noise model's absolute part where normals are reliable
 START_TEMPERATURE = 10.0
+# Factor on T where materials are given.  A light absorbs what wrong normals and materials do to a whole object, so that
+# residuals do not show it.  Without the factor lights have too much contrast, and their dark directions are too dark.
+LIGHT_TEMPERATURE = 4.0
 # Standard deviation of a sun's log radiance: in lights captured outdoors its energy is a third to twice the sky's.
 SUN_DEVIATION = 1.0
 # Least reflectance at the start.  The derivative with respect to the logarithm of a smaller one is nearly zero.
@@ -98,6 +101,7 @@ class FitSchedule(msgspec.Struct, frozen=True):
         estimate_first: True to estimate them before the first descent too; right after a splitting, residuals reflect
             the splitting and not the noise.
         least_temperature: Least temperature of (1).
+        temperature_factor: Factor on the temperature of (1).
         materials_fixed: True to keep the materials fixed.
     """
 
@@ -105,6 +109,7 @@ class FitSchedule(msgspec.Struct, frozen=True):
     descents: tuple[int, ...] = ()
     estimate_first: bool = True
     least_temperature: float = 1.0
+    temperature_factor: float = 1.0
     materials_fixed: bool = False
 
     @property
@@ -137,7 +142,7 @@ def fit_problem(
     pairs = list(zip(illuminations, hyperparameters, strict=True))
     likelihoods = list(problem.spread(lambda pair: with_table(*pair), pairs))
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
-    estimate = partial(estimate_hyperparameters, least=schedule.least_temperature)
+    estimate = partial(estimate_hyperparameters, least=schedule.least_temperature, factor=schedule.temperature_factor)
     for number, iterations in enumerate(schedule.descents):
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
@@ -201,13 +206,16 @@ def with_hyperparameters(likelihood: LightLikelihood, hyperparameters: Hyperpara
     return msgspec.structs.replace(likelihood, log_peaks=np.log(light.peaks), **counts)
 
 
-def estimate_hyperparameters(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:
+def estimate_hyperparameters(
+    likelihood: LightLikelihood, system: System, least: float, factor: float = 1.0
+) -> Hyperparameters:
     """Return the hyperparameters estimated from the residuals and the light at the end of a descent.
 
     Args:
         likelihood: Likelihood at that point.
         system: Normal equations at that point.
         least: Least temperature.
+        factor: Factor on the temperature.
     """
     light = likelihood.light
     cells, free = (np.flatnonzero(np.tile(mask, 3)) for mask in (~light.suns, light.free))
@@ -219,7 +227,8 @@ def estimate_hyperparameters(likelihood: LightLikelihood, system: System, least:
         light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance
     )
     residual = likelihood.illumination.residuals()
-    return Hyperparameters(estimate_temperature(likelihood.illumination.block, residual, least), factors)
+    temperature = estimate_temperature(likelihood.illumination.block, residual, least)
+    return Hyperparameters(factor * temperature, factors)
 
 
 def estimate_temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factorlib.inference.fit import FitSchedule, initial_fit
+from factorlib.inference.fit import LIGHT_TEMPERATURE, FitSchedule, initial_fit
 from factorlib.inference.fit_runner import FitRunner, Solution
 from factorlib.inference.materials import Point
 from factorlib.inference.options import SolveOptions
@@ -21,7 +21,7 @@ from factorlib.light.lobes import Lobes
 from factorlib.results.materials import Channels, vec3
 from factorlib.urm.observations import Observations
 
-LIGHTS = FitSchedule(light_steps=10, descents=(4, 4), materials_fixed=True)
+LIGHTS = FitSchedule(light_steps=10, descents=(4, 4), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
 
 
 def fit_lights(

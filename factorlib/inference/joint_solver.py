@@ -21,7 +21,7 @@ from functools import partial
 
 import msgspec
 
-from factorlib.inference.fit import Fit, FitSchedule, reliable_observations
+from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule, reliable_observations
 from factorlib.inference.fit_runner import FitRunner, Solution, SolveState
 from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.materials import Point
@@ -39,7 +39,9 @@ from factorlib.inference.suns import select_suns
 from factorlib.inference.uncertainty import Posterior
 
 MATERIALS = FitSchedule(light_steps=2, descents=(5, 4))
-LIGHTS = FitSchedule(descents=(0, 2, 2), least_temperature=0.1, materials_fixed=True)
+LIGHTS = FitSchedule(
+    descents=(0, 2, 2), least_temperature=0.1, temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True
+)
 
 
 class SolveRequest(msgspec.Struct, frozen=True):

@@ -28,7 +28,7 @@ from jaxtyping import Float
 
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference.blocks import COMPARISON_LOSS, FIT_LOSS
-from factorlib.inference.fit import Fit, FitSchedule
+from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
 from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light, UnitLobes
@@ -48,7 +48,9 @@ GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))
 # and 13, true suns hold 9 % of the light or more and lower the loss by 1.2 to 15 %.
 LEAST_SUN_GAIN = 0.01
 LEAST_SUN_SHARE = 0.07
-AROUND_SUNS = FitSchedule(descents=(0, 2), least_temperature=0.1, materials_fixed=True)
+AROUND_SUNS = FitSchedule(
+    descents=(0, 2), least_temperature=0.1, temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True
+)
 
 
 def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
