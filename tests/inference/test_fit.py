@@ -4,20 +4,24 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from factorlib.inference.blocks import Noise
 from factorlib.inference.fit import (
     DARK_NOISE,
+    LIGHT_TEMPERATURE,
     Fit,
     FitSchedule,
     estimate_temperature,
     fit_problem,
+    initial_fit,
     reliable_observations,
 )
+from factorlib.inference.joint_solver import LIGHTS
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import cholesky_factor
 from factorlib.inference.material_prior import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, MaterialPrior, material_unknowns
-from factorlib.inference.materials import Materials
+from factorlib.inference.materials import Materials, Point
 from factorlib.inference.optimizer import Arrow, Descent, determinant_terms
 from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve_paper
 from factorlib.inference.problem import JointProblem
@@ -100,6 +104,31 @@ def test_correlated_residuals_count_less():
         one, 3 * np.ones_like(independent)
     )  # outliers
     assert 2 < estimate_temperature(one, 2 * independent) < 4
+
+
+def darkest_fifths(factor: float, seed: int) -> list[float]:
+    """Estimated over true radiance of each light's darkest cells, where normals are wrong by some degrees."""
+    problem, true = photographed(seed, 3)
+    bent = []
+    for k, block in enumerate(problem.blocks):
+        turn = Rotation.from_rotvec(np.radians(3) * np.random.default_rng(seed + k).normal(size=3)).as_matrix()
+        bent.append(msgspec.structs.replace(block, normal=block.normal @ turn.T))
+    start = initial_fit(Point(MATERIALS, [light.with_log_radiance(0 * light.log_radiance) for light in true]))
+    schedule = msgspec.structs.replace(LIGHTS, light_steps=6, temperature_factor=factor)
+    fit = fit_problem(problem.with_blocks(bent), start, PRIOR, schedule)
+    weights = [
+        (light.weight.mean(1), actual.weight.mean(1)) for light, actual in zip(fit.point.lights, true, strict=True)
+    ]
+    darkest = [np.argsort(estimate)[: FEW // 5] for estimate, _ in weights]
+    return [
+        estimate[rows].sum() / actual[rows].sum() for rows, (estimate, actual) in zip(darkest, weights, strict=True)
+    ]
+
+
+def test_dark_directions_are_not_too_dark_where_normals_are_wrong():
+    trusting = [ratio for seed in (1, 2, 3) for ratio in darkest_fifths(1.0, seed)]
+    ratios = [ratio for seed in (1, 2, 3) for ratio in darkest_fifths(LIGHT_TEMPERATURE, seed)]
+    assert 0.8 < np.mean(ratios) < 1.25 and np.mean(trusting) < np.mean(ratios) - 0.1
 
 
 def test_the_contrast_of_a_light_is_found(solved):
