@@ -67,17 +67,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     def read_photo(name: str) -> ComparedPhoto:
         """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
         progress(next(counter), total, f"re-synthesis of {name}")
-        photo = read_exr(inputs["masks"] / f"{name}.exr")
-        geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
-        return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+        return _read_photo(inputs, name)
 
-    solved, held_out = ([n for n, light in lights.items() if light.held_out == value] for value in (False, True))
-    resynthesis = compare_photos(solved, materials, read_photo)
-    predicted = compare_photos(held_out, materials, read_photo) if held_out else None
+    held_out = [name for name, light in lights.items() if light.held_out]
+    resynthesis = compare_photos([name for name in lights if name not in held_out], materials, read_photo)
     # connected components of the graph of materials and lights
     observed = _observed_materials(resynthesis, lights)
     component = material_components({light: names for light, names in observed.items() if names})
     sections = dict.fromkeys(MISSING)
+    sections["held_out"] = compare_photos(held_out, materials, read_photo) if held_out else None
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
         estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the exported lights' gauge
@@ -99,13 +97,17 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
     if not sections["verdict"]:
         reasons["verdict"] = NO_MATERIAL
-    write_json(
-        out / "metrics.json",
-        Metrics(set=counts, resynthesis=resynthesis, held_out=predicted, **sections, reasons=reasons),
-    )
+    write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     if sections["verdict"]:
         write_text(out / "verdict.txt", verdict_text(sections["verdict"]))
     progress(total, total)
+
+
+def _read_photo(inputs: Inputs, name: str) -> ComparedPhoto:
+    """Return a photo and its re-synthesis."""
+    photo = read_exr(inputs["masks"] / f"{name}.exr")
+    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
+    return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
 
 def _observed_materials(resynthesis: ResynthesisErrors, lights: dict[str, LightSlice]) -> dict[str, list[str]]:
