@@ -59,7 +59,7 @@ PHASES = {
     "materials and lights": (11, 7),
 }
 SPLITTING = (7, 9)
-LAST = {"prior": (6, 0.5), "lights": (3, 14), "suns": (4, 10)}
+LAST = {"prior": (1, 3), "lights": (3, 14), "suns": (4, 10)}
 
 
 # Factor on the number of observations where materials are given: +0.25 dB on data/eames, +0.27 on the made set of 101.
@@ -258,9 +258,10 @@ class FitRunner:
         self._record(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
         return fit
 
-    def tick(self, phase: str) -> None:
-        """Report progress of a phase that fits nothing."""
-        self.report(msgspec.structs.replace(self.history[-1], phase=phase))
+    def enter(self, phase: str) -> None:
+        """Report the start of a phase that fits nothing, as an event with the loss of the one before."""
+        last = self.history[-1]
+        self._record(msgspec.structs.replace(last, phase=phase, round=last.round + 1, iteration=0))
 
     def _record(self, event: Event) -> None:
         """Remember and report an event."""

@@ -17,7 +17,6 @@ Every step is a function of the previous state, and `FitRunner` saves each state
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import msgspec
 
@@ -129,8 +128,8 @@ def choose_splittings(request: SolveRequest, state: SolveState) -> SolveState:
 def apply_prior(request: SolveRequest, state: SolveState) -> SolveState:
     """Combine the fitted materials with the prior on materials, by the errors of the model."""
     sample = request.reliable_problem(state).subsample(state.observations, request.options.seed)
-    posterior = Posterior(sample, state.fit, request.run.prior, partial(request.run.tick, "prior"))
-    materials, errors = posterior.with_prior()
+    request.run.enter("prior")
+    materials, errors = Posterior(sample, state.fit, request.run.prior).with_prior()
     fit = msgspec.structs.replace(state.fit, point=Point(materials, state.fit.point.lights))
     return msgspec.structs.replace(state, fit=fit, errors=errors)
 

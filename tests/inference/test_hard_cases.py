@@ -238,7 +238,10 @@ CASES = {
     "NaN, infinite, no direction": Case(with_invalid, 0.051, 0.096, 0.013),
 }  # fmt: skip
 # Beyond the bounds of an earlier solver; docs/hard-cases.md has the numbers.
-BEYOND = ("all Lambertian", "all mirror-like: roughness 0.1", "a light of one point", "normals with noise of 5°")
+BEYOND = (
+    *("all Lambertian", "all mirror-like: roughness 0.1", "a light of one point", "normals with noise of 5°"),
+    "flat objects",
+)
 QUICK = ("flat objects", "an object of 30 pixels", "a single pixel", "1 material × 1 light", "all values clipped")
 
 

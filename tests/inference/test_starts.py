@@ -200,8 +200,8 @@ def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
 
 
 CHOICES = SolveOptions(cells=24, splittings=1, observations=100)
-PARTS = ("effects", "tone", "distances", "materials", "splitting", "lights", "suns")
-ALL = (*PHASES, "splitting 1", "lights", "suns")
+PARTS = ("effects", "tone", "distances", "materials", "splitting", "prior", "lights", "suns")
+ALL = (*PHASES, "splitting 1", "prior", "lights", "suns")
 
 
 class Killed(Exception):
