@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from factorlib.dataset.schema import LightSlice, TruthFile
+from factorlib.dataset.schema import LightSlice, TruthFile, solved_photos
 from factorlib.evaluate.ball import OctahedralLight, octahedral_light
 from factorlib.evaluate.comparison_gauge import material_components
 from factorlib.evaluate.picture_errors import ComparedPhoto, combine_photo, compare_photos
@@ -69,8 +69,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         progress(next(counter), total, f"re-synthesis of {name}")
         return _read_photo(inputs, name)
 
-    held_out = [name for name, light in lights.items() if light.held_out]
-    resynthesis = compare_photos([name for name in lights if name not in held_out], materials, read_photo)
+    solved = solved_photos(lights)
+    held_out = [name for name in lights if name not in solved]
+    resynthesis = compare_photos(solved, materials, read_photo)
     # connected components of the graph of materials and lights
     observed = _observed_materials(resynthesis, lights)
     component = material_components({light: names for light, names in observed.items() if names})

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.dataset.schema import KnownSlice, LightSlice
+from factorlib.dataset.schema import KnownSlice, LightSlice, solved_photos
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
@@ -23,7 +23,7 @@ from factorlib.inference import options
 from factorlib.inference.answer import Answer
 from factorlib.inference.blocks import Noise
 from factorlib.inference.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
-from factorlib.inference.held_out_photos import fit_lights, predicted_exposures
+from factorlib.inference.held_out_photos import fit_held_out_lights, predicted_exposures
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.known import extract_known
@@ -89,7 +89,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     read = count(1)
     check(params)
     declared = _known_values(params, inputs)
-    slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    names_solved = solved_photos(msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice]))
     files = sorted(inputs["urm"].glob("*.parquet"))
     photos = gather_observations(
         files,
@@ -98,7 +98,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         inputs.folders.get("surface"),
         lambda: progress(READING * next(read) / len(files), 1, "observations"),
     )
-    solved = [photo for photo, file in zip(photos, files, strict=True) if not slices[file.stem].held_out]
+    solved = [photo for photo, file in zip(photos, files, strict=True) if file.stem in names_solved]
     _warn(unusable_observations(solved))
     observations = urm.with_exposures(urm.concatenate([photo.merged for photo in solved]), declared.exposure)
     relative = urm.relative_exposures(observations)
@@ -121,7 +121,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / "materials.json", answer.material_table())
     write_json(out / "uncertainty.json", answer.uncertainty())
     everything = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
-    lights, exposures = _held_out_photos(params, inputs, everything, answer)
+    lights, exposures = _held_out_photos(params, inputs, everything, answer, progress)
     write_lobes(out / "lobes.parquet", answer.lights() | lights)
     write_json(out / "exposures.json", answer.exposures() | exposures)
     write_rows(out / "convergence.parquet", Event, solution.history)
@@ -230,7 +230,7 @@ def _run_solver(
 
 
 def _held_out_photos(
-    params: Params, inputs: Inputs, observations: urm.Observations, answer: Answer
+    params: Params, inputs: Inputs, observations: urm.Observations, answer: Answer, progress: Progress
 ) -> tuple[dict[str, Lobes], dict[str, Channels]]:
     """Return the exposures of held-out photos, and lights that no solved photo shows.
 
@@ -239,20 +239,24 @@ def _held_out_photos(
         inputs: Inputs of the stage.
         observations: Observations of all photos.
         answer: Solution of the other photos.
+        progress: Called with the completed work, its total and the current activity.
     """
     slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    solved = {name: slices[name].illumination for name in solved_photos(slices)}
+    held_out = {name: light.illumination for name, light in slices.items() if light.held_out}
     solved_lights = set(answer.lights())
-    shared = {n: s.illumination for n, s in slices.items() if s.held_out and s.illumination in solved_lights}
-    solved = {n: s.illumination for n, s in slices.items() if not s.held_out}
+    shared = {name: light for name, light in held_out.items() if light in solved_lights}
     exposures = predicted_exposures(observations, shared, solved, answer.exposures())
-    numbers = [k for k, light in enumerate(observations.illuminations) if light not in solved_lights]
-    apart = observations.take(np.isin(observations.illumination, numbers))
-    if not len(apart):
+    # photos of lights that no solved photo shows; a black or empty one gets no light, as `export` says
+    numbers = [k for k, name in enumerate(observations.photos) if name in held_out and name not in shared]
+    apart = usable_observations(observations.take(np.isin(observations.photo, numbers)))
+    if not (apart.radiance > 0).any():
         return {}, exposures
     worlds = {n: np.array(s.world_from_camera) for n, s in slices.items() if s.world_from_camera is not None}
     blocks = blocks_of_observations(apart, Noise(), held_out=0.0, world_from_camera=worlds, seed=params.seed)
     problem = JointProblem(blocks, answer.problem.operator, inputs.map)
-    lights, exposures_of_lights = fit_lights(problem, answer.solution, params)
+    progress(1, 1, "lights of held-out photos")
+    lights, exposures_of_lights = fit_held_out_lights(problem, answer.solution, params)
     return lights, exposures | exposures_of_lights
 
 

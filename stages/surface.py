@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Int
 
-from factorlib.dataset.schema import LightSlice, ObjectsSlice
+from factorlib.dataset.schema import LightSlice, ObjectsSlice, solved_photos
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, usable_observations
@@ -71,7 +71,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_json(out / FILE, SurfaceTable())
         return
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    fitted = [name for name in photos if not lights[name].held_out]
+    fitted = sorted(solved_photos(lights))
     observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in fitted}
     attached = {
         name: photos[name].attach(np.column_stack([pixels.x, pixels.y]), surfaces)

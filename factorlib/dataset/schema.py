@@ -6,6 +6,7 @@ values and, as `description`, the cure for others.  A stage converts its facts t
 units and directions are those of `factorlib.conventions`.
 """
 
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
@@ -368,6 +369,11 @@ class LightSlice(msgspec.Struct, frozen=True, omit_defaults=True):
     illumination: str
     world_from_camera: Mat3 | None
     held_out: bool = False
+
+
+def solved_photos(lights: Mapping[str, LightSlice]) -> list[str]:
+    """Return the names of the photos that are not held out, in order."""
+    return [name for name, light in lights.items() if not light.held_out]
 
 
 class GroundSlice(msgspec.Struct, frozen=True):

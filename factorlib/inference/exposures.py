@@ -37,9 +37,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
     Components with known materials or lights, and those of one group, stay as they are.
     """
     theta = state.theta
-    likelihoods = state.likelihoods
-    prior = descent.prior
-    blocks = [likelihood.illumination.block for likelihood in likelihoods]
+    blocks = [likelihood.illumination.block for likelihood in state.likelihoods]
     group = material_groups(blocks, len(theta), known)
     movable = np.zeros(len(theta), bool)
     for members, lights in connected_components(blocks, len(theta)):
@@ -48,7 +46,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
     moving = np.unique(group[movable])
     if not len(moving):
         return state
-    terms = [LightTerms(likelihood, group) for likelihood in likelihoods]
+    terms = [LightTerms(likelihood, group) for likelihood in state.likelihoods]
 
     def move(logs: Float[np.ndarray, " g"]) -> tuple[Float[np.ndarray, "m 7"], Float[np.ndarray, " m"]]:
         """Return the unknowns after a move, and log f of every group."""
@@ -58,12 +56,19 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
         moved[:, :6] += log_factors[group][:, None]
         return moved, log_factors
 
-    def energy(logs: Float[np.ndarray, " g"]) -> float:
-        """Return the sum of the priors after a move."""
+    def energy(logs: Float[np.ndarray, " g"]) -> tuple[float, Float[np.ndarray, " g"]]:
+        """Return the sum of the priors after a move, and its gradient."""
         moved, log_factors = move(logs)
-        return prior.evaluate(moved).value + sum(term.energy(log_factors) for term in terms)
+        on_materials = descent.prior.evaluate(moved)
+        value = on_materials.value
+        slope = np.bincount(group, 2 * on_materials.gradient.reshape(-1, 7)[:, :6].sum(1), len(theta))
+        for term in terms:
+            of_light, slope_of_light = term.energy(log_factors)
+            value = value + of_light
+            slope = slope + slope_of_light
+        return value, slope[moving]
 
-    moved, log_factors = move(minimize(energy, np.zeros(len(moving))).x)
+    moved, log_factors = move(minimize(energy, np.zeros(len(moving)), jac=True).x)
     materials = materials_from_unknowns(moved)
     return descent.linearise([term.moved(log_factors, materials) for term in terms], moved)
 
@@ -89,11 +94,15 @@ class LightTerms:
         self.slope = float(rows @ u)
         self.curvature = float(rows.sum())
 
-    def energy(self, log_factors: Float[np.ndarray, " m"]) -> float:
-        """Return the change of uᵀQu, and the prior of the exposures, after a move."""
+    def energy(self, log_factors: Float[np.ndarray, " m"]) -> tuple[float, Float[np.ndarray, " m"]]:
+        """Return the change of uᵀQu plus the prior of the exposures after a move, and its gradient by log f."""
         shift = -log_factors[self.groups[0]]
-        exposures = self._exposures(log_factors)
-        return shift * (2 * self.slope + shift * self.curvature) + float(np.sum((exposures / EXPOSURE_DEVIATION) ** 2))
+        whitened = self._exposures(log_factors) / EXPOSURE_DEVIATION
+        value = shift * (2 * self.slope + shift * self.curvature) + float(whitened @ whitened)
+        slopes = 2 * whitened / EXPOSURE_DEVIATION  # by each log exposure
+        gradient = -np.bincount(self.groups, slopes, len(log_factors))
+        gradient[self.groups[0]] += slopes.sum() - 2 * (self.slope + shift * self.curvature)
+        return value, gradient
 
     def moved(self, log_factors: Float[np.ndarray, " m"], materials: Materials) -> LightLikelihood:
         """Return the likelihood after a move."""

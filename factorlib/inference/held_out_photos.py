@@ -1,7 +1,7 @@
 """Lights and exposures of held-out photos, given the materials of a solve.
 
 A held-out photo takes no part in the solve, which predicts it.  If solved photos share its light, it has that light.
-Its exposure relative to them is that of EXIF or `known`, if all of these photos have one, and else 1.  Otherwise its
+Its exposure relative to them is that of EXIF or `known` where both have one, and else 1.  Otherwise its
 light is fitted to its own pixels with the materials fixed, so that it tests materials and shape alone.
 """
 
@@ -21,10 +21,10 @@ from factorlib.light.lobes import Lobes
 from factorlib.results.materials import Channels, vec3
 from factorlib.urm.observations import Observations
 
-LIGHTS = FitSchedule(light_steps=10, descents=(4, 4), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
+SCHEDULE = FitSchedule(light_steps=10, descents=(4, 4), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
 
 
-def fit_lights(
+def fit_held_out_lights(
     problem: JointProblem, solution: Solution, options: SolveOptions
 ) -> tuple[dict[str, Lobes], dict[str, Channels]]:
     """Fit lights to the photos of a problem, with the materials of a solution, and return them with the exposures.
@@ -40,7 +40,7 @@ def fit_lights(
     problem = solution.effective_problem(problem).subsample(options.observations, options.seed)
     materials = solution.point.materials
     start = Point(materials, [constant_light(block, materials, options.cells) for block in problem.blocks])
-    fit = FitRunner().fit("held-out photos", problem, initial_fit(start), LIGHTS)
+    fit = FitRunner().fit("held-out photos", problem, initial_fit(start), SCHEDULE)
     lobes: dict[str, Lobes] = {}
     exposures: dict[str, Channels] = {}
     for block, light in zip(problem.blocks, fit.point.lights, strict=True):
@@ -70,7 +70,7 @@ def predicted_exposures(
     exif = dict(zip(observations.photos, observations.exposures or (None,) * len(observations.photos), strict=True))
     result = {}
     for name, light in held_out.items():
-        references = [photo for photo, its in solved.items() if its == light and photo in exposures]
+        references = [photo for photo, its_light in solved.items() if its_light == light and photo in exposures]
         known = [exif.get(photo) or np.nan for photo in [name, *references]]
         ratios = np.nan_to_num(known[0] / np.array(known[1:]), nan=1.0)
         if references:

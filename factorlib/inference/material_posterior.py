@@ -24,8 +24,9 @@ from factorlib.inference.material_prior import Mixture, shipped_classes
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 
 BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
-# Largest standard deviation of a log reflectance in Σ: that of a reflectance near 0, which is known well, is infinite.
+# Largest standard deviation of an unknown in Σ: that of the logarithm of a reflectance near 0 is without limit.
 LARGEST_DEVIATION = 2.0
+LEAST_DEVIATION = 1e-6  # least standard deviation there, so that Σ has an inverse
 
 
 class MaterialPosterior(NamedTuple):
@@ -53,14 +54,15 @@ def material_posterior(
         free: Mask of the unknowns that are not known.
     """
     deviation = np.where(free, np.sqrt(np.diag(covariance)), 0.0)
-    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(deviation, 1e-300))
-    covariance = covariance * np.outer(scale, scale)
-    deviation = deviation * scale
     if not free[3:].any():
         return MaterialPosterior(theta, deviation, np.zeros(7))
     mixture = Mixture(shipped_classes().classes)
-    precision = np.linalg.inv(covariance[np.ix_(free, free)])
-    bounds = [(low, max(high, at)) for (low, high), at, is_free in zip(BOUNDS, theta, free, strict=True) if is_free]
+    # Σ with limited deviations
+    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(deviation, LEAST_DEVIATION))
+    limited = covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)
+    precision = np.linalg.inv(limited[np.ix_(free, free)])
+    bounds = [(low, max(high, value)) for (low, high), value in zip(BOUNDS, theta, strict=True)]
+    free_bounds = [bounds[k] for k in np.flatnonzero(free)]
 
     def objective(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
         """Return (1) and its gradient by the free unknowns."""
@@ -73,12 +75,14 @@ def material_posterior(
 
     # (1) has several minima: one start is the fit, the others have the means of the classes
     starts = [theta, *(np.append(theta[:3], mean) for mean in mixture.mean)]
-    minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
+    minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=free_bounds) for start in starts]
     result = theta.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x
     by_prior = np.zeros((7, 7))
     by_prior[3:, 3:] = mixture.evaluate(result[3:])[2]
     variance = np.zeros(7)
     variance[free] = np.diag(np.linalg.inv(precision + by_prior[np.ix_(free, free)]))
-    share = 1 - variance / np.where(free, deviation**2, 1.0)
-    return MaterialPosterior(result, np.sqrt(variance), np.where(free, share, 0.0).clip(0, 1))
+    share = np.where(free, 1 - variance / np.diag(limited), 0.0).clip(0, 1)
+    # no prior bears on k_d, whose deviation is therefore not limited
+    posterior_deviation = np.where(np.arange(7) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))
+    return MaterialPosterior(result, posterior_deviation, share)

@@ -20,11 +20,12 @@ Gauge       The data leave one factor per channel and component free, so an erro
             synthetic sets it is off by 7 to 50 %.
 
 Joint       For a joint solve (`Posterior`), S comes from the system of φ (`factorlib.inference.likelihood`), by
-            reflectances: by their logarithms, a zero reflectance would look exactly known.  The prior on materials is
-            left out.
+            reflectances: by their logarithms, a zero reflectance would look exactly known.
 
 Model       More observations do not remove errors of the model itself, mostly of the mesh.  MODEL_ERROR is therefore
             added in quadrature, in proportion to the residuals.
+
+Prior       `factorlib.inference.material_posterior` combines this covariance with the prior on materials.
 
 Lights      Given the materials, log radiance of a light has the covariance Σ = H⁻¹.  A map's radiance in direction d is
             Σ_p φ_p(d) w_p with w_p = peak_p exp(u_p).  Its variance is gᵀ Σ g with g_p = φ_p(d) w_p, plus the light's
@@ -126,15 +127,10 @@ class Posterior:
         illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
-    @property
-    def values(self) -> Float[np.ndarray, "m 7"]:
-        """Reflectances, and 1 for roughness: the derivatives of the unknowns of the answer by those of the fit."""
-        return np.column_stack([self.materials.diffuse, self.materials.specular, np.ones(len(self.materials))])
-
     def covariance(self) -> tuple[Float[np.ndarray, "k k"], float]:
         """Return the covariance of reflectances and roughnesses, and the deviation of the residuals."""
         materials = self.materials
-        values = self.values.reshape(-1)
+        values = by_unknowns(materials).reshape(-1)
         # S and s_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
         precision, scores = information(self.systems(with_scores=True), len(values))
         scores = [light_scores / values for light_scores in scores]
@@ -154,16 +150,17 @@ class Posterior:
     def with_prior(self) -> tuple[Materials, MaterialErrors]:
         """Return the materials by `factorlib.inference.material_posterior`, and their standard errors."""
         covariance, deviation = self.covariance()
-        values = self.values
+        values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
         posteriors = []
         for m, theta in enumerate(unknowns):
-            of_material = covariance[7 * m : 7 * m + 7, 7 * m : 7 * m + 7]
-            posteriors.append(material_posterior(theta, of_material / np.outer(values[m], values[m]), free[m]))
+            rows = slice(7 * m, 7 * m + 7)
+            by_logs = covariance[rows, rows] / np.outer(values[m], values[m])
+            posteriors.append(material_posterior(theta, by_logs, free[m]))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
-        scale = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
-        errors = np.minimum(np.array([posterior.deviation for posterior in posteriors]) * scale, WIDTHS)
+        deviations = np.array([posterior.deviation for posterior in posteriors])
+        errors = np.minimum(deviations * by_unknowns(materials), WIDTHS)
         shares = np.array([posterior.prior_share for posterior in posteriors])
         return materials, MaterialErrors(Materials.from_rows(errors), deviation, shares)
 
@@ -195,6 +192,11 @@ class Posterior:
                 COVERAGE_ROWS, 2 * COVERAGE_ROWS, 3
             )
         return maps
+
+
+def by_unknowns(materials: Materials) -> Float[np.ndarray, "m 7"]:
+    """Return the derivatives of reflectances and roughness by the fit's unknowns: the reflectances, and 1."""
+    return np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
 
 
 def information(
@@ -268,7 +270,8 @@ def widest_covariance(
     covariances = inverse, sandwich(inverse, np.vstack(scores)), sandwich(inverse, light_sums)
     in_gauge = [project_to_gauge(covariance, materials, problem) for covariance in covariances]
     variances = np.array([np.diag(covariance) for covariance in in_gauge]).clip(0)
-    scale = np.sqrt(variances.max(0) / np.maximum(variances[0], 1e-300))
+    deviation = np.sqrt(variances)
+    scale = np.where(deviation[0] > 0, deviation.max(0) / np.where(deviation[0] > 0, deviation[0], 1.0), 0.0)
     covariance = in_gauge[0] * np.outer(scale, scale)
     np.fill_diagonal(covariance, variances.max(0))
     return covariance

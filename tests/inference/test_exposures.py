@@ -76,6 +76,16 @@ def test_a_balance_predicts_the_same_radiance_and_lowers_the_objective():
         np.testing.assert_allclose(new.illumination.radiance(), old.illumination.radiance(), rtol=1e-6)
         assert abs(new.light.log_exposure[1]) < old.light.log_exposure[1] - 0.1 and new.light.log_exposure[0] == 0
     assert after.value < before.value - 1
+    # no other factor of the second material is better
+    for change in (-0.05, 0.05):
+        theta = after.theta.copy()
+        theta[1, :6] += change
+        lights = []
+        for likelihood in after.likelihoods:
+            light = likelihood.light
+            exposures = light.log_exposure - np.array([0.0, change])
+            lights.append(likelihood.with_point(msgspec.structs.replace(light, log_exposure=exposures)))
+        assert descent.linearise(lights, theta).value > after.value
     again = balance_exposures(after, descent, KnownValues())
     np.testing.assert_allclose(again.theta, after.theta, atol=1e-3)
 

@@ -67,3 +67,15 @@ def test_known_unknowns_stay():
     free[3:] = [True] * 3 + [False]
     partly = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.5), 0.0), free)
     assert partly.theta[6] == ENAMEL[6] and partly.deviation[6] == 0 and (partly.theta[3:6] != ENAMEL[3:6]).any()
+
+
+def test_a_reflectance_near_zero_does_not_look_exactly_known():
+    """Its logarithm has no limit, and its error is that of the observations."""
+    black = np.array([*np.log([1e-5] * 3), *ENAMEL[3:]])
+    posterior = material_posterior(black, covariance([2000.0] * 3 + [0.1] * 3 + [0.05]), ALL)
+    np.testing.assert_allclose(posterior.deviation[:3] * 1e-5, 0.02, rtol=0.05)
+
+
+def test_observations_without_any_error_decide():
+    posterior = material_posterior(ENAMEL, np.zeros((7, 7)), ALL)
+    np.testing.assert_allclose(posterior.theta, ENAMEL, atol=1e-6)

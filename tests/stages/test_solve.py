@@ -280,3 +280,14 @@ def test_exposures_of_held_out_photos_follow_exif(tmp_path, linked):
     light |= {"c": {"illumination": "a", "world_from_camera": None, "held_out": True}}
     out = run(tmp_path, {"a": a, "b": b, "c": c}, light=light)
     assert read_json(out / "exposures.json")["c"] == [4.0] * 3
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_a_held_out_photo_without_a_usable_value_gets_no_light_and_spoils_nothing(tmp_path, linked, solved, value):
+    dark = observations("d", [1], 7)
+    photos = linked | {"d": msgspec.structs.replace(dark, radiance=np.full_like(dark.radiance, value))}
+    light = {name: {"illumination": name, "world_from_camera": None} for name in photos}
+    light["d"]["held_out"] = True
+    out = run(tmp_path, photos, light=light)
+    assert (out / "materials.json").read_bytes() == (solved / "materials.json").read_bytes()
+    assert set(read_lobes(out / "lobes.parquet")) == {"a", "b"}
