@@ -278,6 +278,14 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
                 f"no object is made of material {name!r}",
                 "leave it out, or add the object that shows it",
             )
+            if reflectance.diffuse is None:
+                refuse.refuse_if(
+                    not reflectance.kind or bool(reflectance.specular or reflectance.roughness),
+                    key,
+                    "its diffuse reflectance is missing",
+                    "give `diffuse: [r, g, b]`, or `kind` alone",
+                )
+                continue
             specular = reflectance.specular or (0.0, 0.0, 0.0)
             refuse.refuse_if(
                 not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0,
@@ -331,7 +339,7 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
                 cure = "give the ball a material of its own"
                 refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)
             known = spec.known.materials.get(material)
-            if known is None or any(known.diffuse) or not known.specular:
+            if known is None or known.diffuse is None or any(known.diffuse) or not known.specular:
                 cure = (
                     f"write known.materials.{material}: "
                     "{diffuse: [0, 0, 0], specular: [0.55, 0.55, 0.55]}, as chrome's is"

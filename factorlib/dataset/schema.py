@@ -40,6 +40,7 @@ Vec2 = tuple[Number, Number]
 Vec3 = tuple[Number, Number, Number]
 Shares = tuple[Share, Share, Share]
 Mat3 = tuple[Vec3, Vec3, Vec3]  # rows
+MaterialKind = Literal["metal", "fabric", "plastic", "paint", "wood", "stone"]
 Masks = str | dict[str, str]  # a label PNG, a COCO json, or {material: PNG}
 
 
@@ -210,11 +211,16 @@ class CameraSource(_Format, frozen=True):
 
 
 class KnownMaterial(_Format, frozen=True):
-    """Known reflectance of a material, linear Rec. 709; a value of None is estimated."""
+    """Known reflectance of a material, linear Rec. 709, or its kind alone; a value of None is estimated.
 
-    diffuse: Shares
+    Attributes:
+        kind: metal, fabric, or a dielectric; it chooses the class of the prior on materials
+    """
+
+    diffuse: Shares | None = None
     specular: Shares | None = None
     roughness: Roughness | None = None
+    kind: MaterialKind | None = None
 
 
 class MirrorBall(_Format, frozen=True):

@@ -91,7 +91,8 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         relative = errors.specular.mean(1) / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
         specular = self.solution.materials.point.materials.specular
         rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
-        return [table.Kind(*likeliest_class(*row)) for row in rows]
+        classes = self.problem.known.classes
+        return [table.Kind(*likeliest_class(*row, classes.get(m))) for m, row in enumerate(rows)]
 
     def _known_rule(self) -> str:
         """Return a sentence that names what fixes scale and white balance; empty if nothing is known beforehand."""

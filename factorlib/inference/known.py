@@ -47,6 +47,8 @@ LEAST_COVERAGE = 0.5  # least covered share of a known cell's integral
 LEAST_RELATIVE_RADIANCE = 1e-6  # least radiance, as a share of the mean
 LEAST_SOLID_ANGLE = 1e-12  # least solid angle, steradians
 MAP_ROWS = 128  # most rows of a map; a larger one is averaged down
+# Class of the prior on materials by kind, where they differ in name.
+CLASSES = dict.fromkeys(("plastic", "paint", "wood", "stone"), "dielectric")
 LEAST_BALL_PIXELS = 1000  # pixels: they mirror directions 6° apart, and cells are 10° wide
 
 
@@ -55,17 +57,19 @@ class KnownValues(msgspec.Struct, frozen=True):
 
     Attributes:
         materials: k_d, k_s (RGB each) and roughness by number of the material; NaN for an unknown value.
+        classes: Class of the prior on materials (`factorlib.inference.material_prior`) by number of the material.
         lights: Light by illumination, in the radiance of its photos, with its known cells (`Light.fixed`).
         exposures: Illuminations whose photos have known exposures; radiance has been divided by them.
     """
 
     materials: dict[int, Float[np.ndarray, "7"]] = {}
+    classes: dict[int, str] = {}
     lights: dict[str, Light] = {}
     exposures: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
-        """True if nothing is known."""
+        """True if no value is known."""
         return not (self.materials or self.lights or self.exposures)
 
     def insert_into(self, materials: Materials) -> Materials:
@@ -219,9 +223,9 @@ def extract_known(
         world = photos[ball.photo].world_from_camera
         lights[name] = light_from_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
         observations = observations.take(beside_ball)
-    return observations, KnownValues(
-        rows, lights, tuple(sorted({photos[photo].illumination for photo in declared.exposure}))
-    )
+    classes = {number(name): CLASSES.get(one.kind, one.kind) for name, one in declared.materials.items() if one.kind}
+    exposures = tuple(sorted({photos[photo].illumination for photo in declared.exposure}))
+    return observations, KnownValues(rows, classes, lights, exposures)
 
 
 def _known_rows(declared: KnownSlice, observations: Observations) -> dict[str, Float[np.ndarray, "7"]]:
@@ -236,6 +240,8 @@ def _known_rows(declared: KnownSlice, observations: Observations) -> dict[str, F
         if not (observations.material == list(observations.materials).index(name)).any():
             cure = "check in the overlays of `align` that mask and mesh show it in the same pixels"
             raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
+        if known.diffuse is None:
+            continue
         roughness = known.roughness or (ROUGHNESS[0] if name in chrome else np.nan)
         rows[name] = np.array([*known.diffuse, *(known.specular or (np.nan,) * 3), roughness])
     return rows

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from factorlib.inference.material_prior import Mixture, shipped_classes
+from factorlib.inference.material_prior import Mixture, classes_of
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 
 BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
@@ -44,7 +44,7 @@ class MaterialPosterior(NamedTuple):
 
 
 def material_posterior(
-    theta: Float[np.ndarray, "7"], covariance: Float[np.ndarray, "7 7"], free: Bool[np.ndarray, "7"]
+    theta: Float[np.ndarray, "7"], covariance: Float[np.ndarray, "7 7"], free: Bool[np.ndarray, "7"], name: str | None = None
 ) -> MaterialPosterior:
     """Return the posterior of one material by (1).
 
@@ -52,11 +52,12 @@ def material_posterior(
         theta: θ̂.
         covariance: Σ.
         free: Mask of the unknowns that are not known.
+        name: Class of the material, if the user named it.
     """
     deviation = np.where(free, np.sqrt(np.diag(covariance)), 0.0)
     if not free[3:].any():
         return MaterialPosterior(theta, deviation, np.zeros(7))
-    mixture = Mixture(shipped_classes().classes)
+    mixture = Mixture(classes_of(name))
     # Σ with limited deviations
     scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(deviation, LEAST_DEVIATION))
     limited = covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)

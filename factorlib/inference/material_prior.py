@@ -11,7 +11,7 @@ reflectances and the unknown white balance of photos (`SCALE_DEVIATION`, `CLASS_
 `WHITE_DEVIATION`).  Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, 0.02 to 0.08, equally in all
 colours.  Metals reflect more, with a tint.  Fabrics scatter within, and GGX shows this as a strong and very rough part.
 A smooth surface with k_s = 0.3 is therefore metal, and a k_s of 0.2 at roughness 1 is fabric; neither is inferred
-without evidence.
+without evidence.  Where the user names a material's class, that one alone has a share.
 
 Let r_c be the share of class c in the sum (1).  Half the gradient of −2 log p is Σ_c r_c P_c (x − μ_c), P_c the class's
 precision.  Half the Hessian is approximated by Σ_c r_c P_c, the Hessian of the bound of expectation maximisation, which
@@ -106,6 +106,11 @@ def shipped_classes() -> Classes:
         return msgspec.convert(read_json(SHIPPED), Classes)
 
 
+def classes_of(name: str | None) -> tuple[MaterialClass, ...]:
+    """Return the classes that a material may have: the named one, or all of them."""
+    return tuple(one for one in shipped_classes().classes if name in (None, one.name))
+
+
 class Mixture:
     """Mixture of material classes, (1).
 
@@ -170,7 +175,7 @@ class MaterialPrior:
         self.mean = material_unknowns(start)
         self.wide = np.array([DIFFUSE_DEVIATION**-2.0] * 3 + [0.0] * 3 + [ROUGHNESS_DEVIATION**-2.0])
         self.specular = np.flatnonzero((start.specular > LEAST_REFLECTANCE).any(1)).tolist()
-        self.mixture = Mixture(shipped_classes().classes)
+        self.mixtures = [Mixture(classes_of(known.classes.get(m))) for m in range(len(start))]
         self.members = [
             list(members)
             for members, lights in connected_components(blocks, len(start))
@@ -185,7 +190,7 @@ class MaterialPrior:
         gradient = off * self.wide
         hessians = np.tile(np.diag(self.wide), (len(theta), 1, 1))
         for m in self.specular:
-            energy, slope, curvature, _ = self.mixture.evaluate(theta[m, 3:])
+            energy, slope, curvature, _ = self.mixtures[m].evaluate(theta[m, 3:])
             value = value + energy
             gradient[m, 3:] = gradient[m, 3:] + slope
             hessians[m, 3:, 3:] += curvature
@@ -206,7 +211,7 @@ class MaterialPrior:
 
 
 def likeliest_class(
-    specular: Float[np.ndarray, "3"], roughness: float, relative: float, rough: float
+    specular: Float[np.ndarray, "3"], roughness: float, relative: float, rough: float, name: str | None = None
 ) -> tuple[str, float]:
     """Return the likeliest class of a material and its probability.
 
@@ -217,8 +222,9 @@ def likeliest_class(
         roughness: Roughness.
         relative: Standard error of log k_s.
         rough: Standard error of roughness.
+        name: Class that the user named.
     """
-    mixture = Mixture(shipped_classes().classes, relative, rough)
+    mixture = Mixture(classes_of(name), relative, rough)
     x = np.append(np.log(np.maximum(specular, LEAST_REFLECTANCE)), roughness)
     probability = mixture.evaluate(x)[3]
     best = int(probability.argmax())

@@ -157,7 +157,7 @@ class Posterior:
         for m, theta in enumerate(unknowns):
             rows = slice(7 * m, 7 * m + 7)
             by_logs = covariance[rows, rows] / np.outer(values[m], values[m])
-            posteriors.append(material_posterior(theta, by_logs, free[m]))
+            posteriors.append(material_posterior(theta, by_logs, free[m], self.problem.known.classes.get(m)))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
         deviations = np.array([posterior.deviation for posterior in posteriors])
         errors = np.minimum(deviations * by_unknowns(materials), WIDTHS)

@@ -79,3 +79,9 @@ def test_a_reflectance_near_zero_does_not_look_exactly_known():
 def test_observations_without_any_error_decide():
     posterior = material_posterior(ENAMEL, np.zeros((7, 7)), ALL)
     np.testing.assert_allclose(posterior.theta, ENAMEL, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "least", "most"), [("dielectric", 0.01, 0.06), ("metal", 0.06, 0.3)])
+def test_a_named_class_decides_where_observations_are_silent(name, least, most):
+    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [30.0] * 3 + [10.0]), ALL, name)
+    assert least < np.exp(posterior.theta[3:6].mean()) < most

@@ -216,6 +216,13 @@ def test_a_known_material_is_written_as_it_was_given_and_said(tmp_path, linked, 
     assert "more than falls on it" in caplog.text
 
 
+def test_a_named_kind_chooses_the_class_and_fixes_no_value(tmp_path, linked):
+    out = table(run(tmp_path, linked, known={"materials": {"green": {"kind": "metal"}}}))
+    green = out["materials"]["green"]
+    assert green["kind"] == {"name": "metal", "probability": 1.0} and "given" not in green
+    assert "come from these" not in out["gauge"]["rule"]
+
+
 def test_a_known_material_that_nothing_shows_and_another_solver_are_refused(tmp_path, linked):
     known = {"materials": {"blue": {"diffuse": [0.2, 0.4, 0.25]}}}
     refusal("no observation shows material 'blue'", run, tmp_path, {"a": linked["a"]}, known=known)
