@@ -2,14 +2,15 @@
 
 A fit weighs observations as if the model were exact but for independent noise, so that a wrong mesh can outweigh any
 prior: stone becomes enamel.  Once the errors of the model are known (`factorlib.inference.uncertainty`), each material
-is estimated again.  With θ = (log k_d, log k_s, roughness), θ̂ the fit and Σ its covariance, errors of the model
-included, it minimises
+is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, S its covariance by the observations alone, and
+M that of the errors of the model.  p is the mixture of classes of `factorlib.inference.material_prior`.  θ minimises
 
-    (θ − θ̂)ᵀ Σ⁻¹ (θ − θ̂) − 2 log p(log k_s, roughness)                                                              (1)
+    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + S g                                     (1)
 
-with p the classes of `factorlib.inference.material_prior`.  Σ couples k_d to k_s, so k_d follows.  Its covariance is
-(Σ⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one less the
-ratio of its two variances.
+with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior, and θ₀ is the estimate of the observations
+without it.  So without errors of the model (M = 0) θ̂ stays.  S couples k_d to k_s, so k_d follows.  The covariance is
+((S + M)⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one less
+the ratio of its variance to that in S + M.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from factorlib.inference.material_prior import Mixture, classes_of
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 
 BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
-# Largest standard deviation of an unknown in Σ: that of the logarithm of a reflectance near 0 is without limit.
+# Largest standard deviation of an unknown in S: that of the logarithm of a reflectance near 0 is without limit.
 LARGEST_DEVIATION = 2.0
-LEAST_DEVIATION = 1e-6  # least standard deviation there, so that Σ has an inverse
+LEAST_DEVIATION = 1e-6  # least standard deviation in S, so that it has an inverse
 
 
 class MaterialPosterior(NamedTuple):
@@ -44,40 +45,48 @@ class MaterialPosterior(NamedTuple):
 
 
 def material_posterior(
-    theta: Float[np.ndarray, "7"], covariance: Float[np.ndarray, "7 7"], free: Bool[np.ndarray, "7"], name: str | None = None
+    fitted: Float[np.ndarray, "7"],
+    covariance: Float[np.ndarray, "7 7"],
+    model_error: Float[np.ndarray, "7"],
+    free: Bool[np.ndarray, "7"],
+    name: str | None = None,
 ) -> MaterialPosterior:
     """Return the posterior of one material by (1).
 
     Args:
-        theta: θ̂.
-        covariance: Σ.
+        fitted: θ̂.
+        covariance: S.
+        model_error: Standard deviations of M, which is diagonal.
         free: Mask of the unknowns that are not known.
         name: Class of the material, if the user named it.
     """
-    deviation = np.where(free, np.sqrt(np.diag(covariance)), 0.0)
+    deviation = np.where(free, np.sqrt(np.diag(covariance) + model_error**2), 0.0)
     if not free[3:].any():
-        return MaterialPosterior(theta, deviation, np.zeros(7))
+        return MaterialPosterior(fitted, deviation, np.zeros(7))
     mixture = Mixture(classes_of(name))
-    # Σ with limited deviations
-    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(deviation, LEAST_DEVIATION))
+    # S with limited deviations, θ₀ and S + M
+    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(np.sqrt(np.diag(covariance)), LEAST_DEVIATION))
     limited = covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)
+    slope_at_fit = np.where(free, np.append(np.zeros(3), mixture.evaluate(fitted[3:])[1]), 0.0)
+    center = fitted + np.where(free, limited @ slope_at_fit, 0.0)
+    limited += np.diag(model_error**2)
     precision = np.linalg.inv(limited[np.ix_(free, free)])
-    bounds = [(low, max(high, value)) for (low, high), value in zip(BOUNDS, theta, strict=True)]
+    bounds = [(low, max(high, value)) for (low, high), value in zip(BOUNDS, fitted, strict=True)]
     free_bounds = [bounds[k] for k in np.flatnonzero(free)]
 
     def objective(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
         """Return (1) and its gradient by the free unknowns."""
-        full = theta.copy()
+        full = fitted.copy()
         full[free] = unknowns
-        off = unknowns - theta[free]
+        off = unknowns - center[free]
         energy, slope, _, _ = mixture.evaluate(full[3:])
         gradient = np.append(np.zeros(3), slope)[free]
         return float(off @ precision @ off) + energy, 2 * (precision @ off + gradient)
 
     # (1) has several minima: one start is the fit, the others have the means of the classes
-    starts = [theta, *(np.append(theta[:3], mean) for mean in mixture.mean)]
+    starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean)]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=free_bounds) for start in starts]
-    result = theta.copy()
+    result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x
     by_prior = np.zeros((7, 7))
     by_prior[3:, 3:] = mixture.evaluate(result[3:])[2]

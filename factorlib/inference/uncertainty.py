@@ -128,23 +128,22 @@ class Posterior:
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
     def covariance(self) -> tuple[Float[np.ndarray, "k k"], float]:
-        """Return the covariance of reflectances and roughnesses, and the deviation of the residuals."""
+        """Return the covariance of reflectances and roughnesses by the observations, and the residuals' deviation."""
         materials = self.materials
         values = by_unknowns(materials).reshape(-1)
         # S and s_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
         precision, scores = information(self.systems(with_scores=True), len(values))
         scores = [light_scores / values for light_scores in scores]
         covariance = widest_covariance(precision / np.outer(values, values), scores, materials, self.problem)
-        deviation = residual_deviation(self.problem, self.fit.point)
-        covariance += np.diag((deviation * np.tile(MODEL_ERROR, len(materials)) * values) ** 2)
-        free = self.problem.known.free(len(materials))
-        return np.where(np.outer(free, free), covariance, 0.0), deviation
+        return covariance, residual_deviation(self.problem, self.fit.point)
 
     def standard_errors(self) -> MaterialErrors:
         """Return the standard error of every material unknown by the observations alone."""
         covariance, deviation = self.covariance()
+        free = self.problem.known.free(len(self.materials)).reshape(-1, 7)
+        model_errors = free * deviation * MODEL_ERROR * by_unknowns(self.materials)
         # an error is at most the width of its unknown's range
-        errors = np.minimum(np.sqrt(np.diag(covariance)).reshape(-1, 7), WIDTHS)
+        errors = np.minimum(np.hypot(np.sqrt(np.diag(covariance).reshape(-1, 7)), model_errors), WIDTHS)
         return MaterialErrors(Materials.from_rows(errors), deviation, np.zeros_like(errors))
 
     def with_prior(self) -> tuple[Materials, MaterialErrors]:
@@ -157,7 +156,8 @@ class Posterior:
         for m, theta in enumerate(unknowns):
             rows = slice(7 * m, 7 * m + 7)
             by_logs = covariance[rows, rows] / np.outer(values[m], values[m])
-            posteriors.append(material_posterior(theta, by_logs, free[m], self.problem.known.classes.get(m)))
+            name = self.problem.known.classes.get(m)
+            posteriors.append(material_posterior(theta, by_logs, deviation * MODEL_ERROR, free[m], name))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
         deviations = np.array([posterior.deviation for posterior in posteriors])
         errors = np.minimum(deviations * by_unknowns(materials), WIDTHS)

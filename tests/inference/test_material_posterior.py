@@ -12,6 +12,9 @@ ALL = np.ones(7, bool)
 CLASSES = Mixture(shipped_classes().classes)
 
 
+NO_ERROR = np.zeros(7)
+
+
 def covariance(deviation, correlation: float = 0.0) -> np.ndarray:
     """Equal correlation of k_d and k_s in each channel, and no other."""
     deviations = np.broadcast_to(deviation, 7)
@@ -21,15 +24,32 @@ def covariance(deviation, correlation: float = 0.0) -> np.ndarray:
     return result
 
 
+def random_covariance(seed: int) -> np.ndarray:
+    root = np.random.default_rng(seed).normal(size=(7, 7)) * np.array([0.3] * 6 + [0.1])[:, None]
+    return root @ root.T + np.diag([0.01] * 7)
+
+
 def test_exact_observations_decide():
-    posterior = material_posterior(ENAMEL, covariance(1e-3), ALL)
+    posterior = material_posterior(ENAMEL, covariance(1e-3), NO_ERROR, ALL)
     np.testing.assert_allclose(posterior.theta, ENAMEL, atol=1e-4)
     assert (posterior.prior_share < 1e-3).all()
     np.testing.assert_allclose(posterior.deviation, 1e-3, rtol=1e-3)
 
 
-def test_where_observations_are_silent_the_material_is_a_likely_one():
-    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [30.0] * 3 + [10.0]), ALL)
+@pytest.mark.parametrize("seed", range(6))
+def test_without_errors_of_the_model_a_fit_under_the_prior_stays(seed):
+    """The fit minimises (θ − θ₀)ᵀ S⁻¹ (θ − θ₀) − 2 log p, whose posterior is itself."""
+    sigma = random_covariance(seed)
+    precision = np.linalg.inv(sigma)
+    fit = minimize(
+        lambda x: (x - ENAMEL) @ precision @ (x - ENAMEL) + CLASSES.evaluate(x[3:])[0], ENAMEL, bounds=BOUNDS, tol=1e-12
+    )
+    posterior = material_posterior(fit.x, sigma, NO_ERROR, ALL)
+    np.testing.assert_allclose(posterior.theta, fit.x, atol=1e-3)
+
+
+def test_where_the_model_is_wrong_the_material_is_a_likely_one():
+    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [0.01] * 4), np.array([0] * 3 + [30.0] * 4), ALL)
     modes = [minimize(lambda x: CLASSES.evaluate(x)[0], mean, tol=1e-10).fun for mean in CLASSES.mean]
     assert CLASSES.evaluate(posterior.theta[3:])[0] == pytest.approx(min(modes), abs=1.0)
     assert (posterior.prior_share[3:] > 0.8).all() and (posterior.prior_share[:3] < 0.01).all()
@@ -39,13 +59,13 @@ def test_where_observations_are_silent_the_material_is_a_likely_one():
 @pytest.mark.parametrize("seed", range(6))
 def test_no_point_of_a_search_has_less_energy(seed):
     random = np.random.default_rng(seed)
-    root = random.normal(size=(7, 7)) * np.array([0.3] * 6 + [0.1])[:, None]
-    sigma = root @ root.T + np.diag([0.01] * 7)
-    posterior = material_posterior(ENAMEL, sigma, ALL)
-    precision = np.linalg.inv(sigma)
+    sigma, errors = random_covariance(seed), np.array([0.1] * 3 + [0.4] * 3 + [0.1])
+    posterior = material_posterior(ENAMEL, sigma, errors, ALL)
+    center = ENAMEL + sigma @ np.append(np.zeros(3), CLASSES.evaluate(ENAMEL[3:])[1])
+    precision = np.linalg.inv(sigma + np.diag(errors**2))
 
     def energy(x: np.ndarray) -> float:
-        return (x - ENAMEL) @ precision @ (x - ENAMEL) + CLASSES.evaluate(x[3:])[0]
+        return (x - center) @ precision @ (x - center) + CLASSES.evaluate(x[3:])[0]
 
     low, high = BOUNDS[6]
     starts = np.column_stack([random.normal(ENAMEL[:6], 1.0, (20, 6)), random.uniform(low, high, 20)])
@@ -55,33 +75,39 @@ def test_no_point_of_a_search_has_less_energy(seed):
 
 
 def test_the_diffuse_part_takes_what_the_specular_part_loses():
-    posterior = material_posterior(ENAMEL, covariance([0.3] * 3 + [1.0] * 3 + [0.3], correlation=-0.9), ALL)
-    assert (posterior.theta[3:6] < ENAMEL[3:6] - 0.2).all() and (posterior.theta[:3] > ENAMEL[:3] + 0.05).all()
+    """Errors of the model give the prior its say, and k_d follows by the observations' correlation."""
+    sigma = covariance([0.3] * 3 + [0.5] * 3 + [0.1], correlation=-0.9)
+    center = ENAMEL + sigma @ np.append(np.zeros(3), CLASSES.evaluate(ENAMEL[3:])[1])
+    off = material_posterior(ENAMEL, sigma, np.array([0.0] * 3 + [1.0] * 3 + [0.5]), ALL).theta - center
+    share = sigma[0, 3] / (sigma[3, 3] + 1.0)
+    assert (off[3:6] < -0.2).all()
+    np.testing.assert_allclose(off[:3], share * off[3:6], rtol=1e-3)
 
 
 def test_known_unknowns_stay():
     free = np.array([True] * 3 + [False] * 4)
-    posterior = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.2), 0.0), free)
+    errors = np.full(7, 0.3)
+    posterior = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.2), 0.0), errors, free)
     np.testing.assert_array_equal(posterior.theta, ENAMEL)
     assert (posterior.deviation[3:] == 0).all() and (posterior.prior_share == 0).all()
     free[3:] = [True] * 3 + [False]
-    partly = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.5), 0.0), free)
+    partly = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.5), 0.0), errors, free)
     assert partly.theta[6] == ENAMEL[6] and partly.deviation[6] == 0 and (partly.theta[3:6] != ENAMEL[3:6]).any()
 
 
 def test_a_reflectance_near_zero_does_not_look_exactly_known():
     """Its logarithm has no limit, and its error is that of the observations."""
     black = np.array([*np.log([1e-5] * 3), *ENAMEL[3:]])
-    posterior = material_posterior(black, covariance([2000.0] * 3 + [0.1] * 3 + [0.05]), ALL)
+    posterior = material_posterior(black, covariance([2000.0] * 3 + [0.1] * 3 + [0.05]), NO_ERROR, ALL)
     np.testing.assert_allclose(posterior.deviation[:3] * 1e-5, 0.02, rtol=0.05)
 
 
 def test_observations_without_any_error_decide():
-    posterior = material_posterior(ENAMEL, np.zeros((7, 7)), ALL)
+    posterior = material_posterior(ENAMEL, np.zeros((7, 7)), NO_ERROR, ALL)
     np.testing.assert_allclose(posterior.theta, ENAMEL, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "least", "most"), [("dielectric", 0.01, 0.06), ("metal", 0.06, 0.3)])
-def test_a_named_class_decides_where_observations_are_silent(name, least, most):
-    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [30.0] * 3 + [10.0]), ALL, name)
+def test_a_named_class_decides_where_the_model_is_wrong(name, least, most):
+    posterior = material_posterior(ENAMEL, covariance(0.01), np.array([0] * 3 + [30.0] * 4), ALL, name)
     assert least < np.exp(posterior.theta[3:6].mean()) < most
