@@ -120,7 +120,7 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
         return attach_pixels(pixels, object_number, self.poses.camera.camera(width, height), objects, surfaces)
 
     def detail_channels(self, surfaces: Surfaces, detail: Detail) -> Channels:
-        """Return the channels normal.x, .y, .z (camera frame) and detail (factor on the diffuse reflectance).
+        """Return normal.x, .y, .z (camera frame) and detail.R, .G, .B (factor on the diffuse reflectance).
 
         All are 0 at pixels without a mesh.
         """
@@ -130,10 +130,11 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
             for kind in ("normal", "view")
         )
         attached = self.attach(np.column_stack([x, y]), surfaces)
-        picture = np.zeros((*self.geometry["object"].shape, 4), np.float32)
+        picture = np.zeros((*self.geometry["object"].shape, 6), np.float32)
         picture[y, x, :3] = attached.turn_normals(normal, view, detail.turn)
-        picture[y, x, 3] = attached.factor(detail.log_factor)
-        return dict(zip(("normal.x", "normal.y", "normal.z", "detail"), np.moveaxis(picture, -1, 0)))
+        picture[y, x, 3:] = attached.factor(detail.log_factor)
+        names = [*(f"normal.{axis}" for axis in "xyz"), *(f"detail.{channel}" for channel in "RGB")]
+        return dict(zip(names, np.moveaxis(picture, -1, 0)))
 
 
 def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, AlignedPhoto]:

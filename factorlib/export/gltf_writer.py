@@ -78,7 +78,7 @@ def write_glb(
             bases = [core["baseColorFactor"][:3] for core in cores]
             factor = min(float(part.detail.max()), 1 / max(float(np.max(bases)), 1e-9))
             shade = np.rint(255 * np.minimum(part.detail / factor, 1)).astype(np.uint8)
-            visual.vertex_attributes["color"] = np.column_stack([shade, shade, shade, np.full_like(shade, 255)])
+            visual.vertex_attributes["color"] = np.column_stack([shade, np.full(len(shade), 255, np.uint8)])
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
         painted = part.detail is not None

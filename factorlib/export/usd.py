@@ -89,9 +89,9 @@ def shader_inputs(material: Reflectance) -> dict[str, float | np.ndarray]:
     return {"diffuseColor": base, "roughness": roughness, "specularColor": specular, "useSpecularWorkflow": 1}
 
 
-def colours(material: Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+def colours(material: Reflectance, detail: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """Return diffuseColor at the vertices of a mesh with detail."""
-    return np.minimum(detail[:, None] * shader_inputs(material)["diffuseColor"], 1.0)
+    return np.minimum(detail * shader_inputs(material)["diffuseColor"], 1.0)
 
 
 def with_roughness_of_file(material: Reflectance) -> Reflectance:

@@ -94,7 +94,7 @@ class Block(msgspec.Struct, frozen=True):
         confidence: Confidence of the normals, 0 to 1; None if all are equally reliable.
         place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
         row: Index of the observation among all usable ones.
-        detail: Factor on the diffuse reflectance of each observation's material; None for 1.
+        detail: Factor on the diffuse reflectance of each observation's material, per channel; None for 1.
     """
 
     name: str
@@ -115,7 +115,7 @@ class Block(msgspec.Struct, frozen=True):
     confidence: Float[np.ndarray, " n"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
     row: Int[np.ndarray, " n"] | None = None
-    detail: Float[np.ndarray, " n"] | None = None
+    detail: Float[np.ndarray, "n 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -161,12 +161,12 @@ class Block(msgspec.Struct, frozen=True):
             self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
         )
 
-    def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, " n"]) -> Block:
+    def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, "n 3"]) -> Block:
         """Return the same observations with other normals and with a detail of reflectance.
 
         The block must have no detail yet.
         """
-        bounced = None if self.bounced is None else self.bounced * np.where(np.arange(6) < 3, detail[:, None], 1.0)
+        bounced = None if self.bounced is None else self.bounced * np.hstack([detail, np.ones_like(detail)])
         return msgspec.structs.replace(self, normal=normal, detail=detail, bounced=bounced)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

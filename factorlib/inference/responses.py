@@ -1,9 +1,9 @@
 """Responses of observations to lobes of weight one: the reflection operator evaluated for the rows of a block.
 
-    D_ip → a_i v_ip D_ip   diffuse response of observation i to lobe p, for k_d = 1
-    S_ip → u_ip S_ip       specular response, for k_s = 1
+    D_ip → v_ip D_ip   diffuse response of observation i to lobe p, for k_d = 1
+    S_ip → u_ip S_ip   specular response, for k_s = 1
 
-a is the block's detail of reflectance, where it has one.  v and u are the shares of each lobe's reflection that shadows
+v and u are the shares of each lobe's reflection that shadows
 leave: (1) and (2) of `factorlib.light.visibility`, and 1 without visibility.
 
 The cells of a light stay in place during a descent, so responses depend on materials through their roughness alone.
@@ -54,8 +54,7 @@ def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Opera
     nz, _, larger = lobe_cosines(block, rows, lobes)
     with torch.no_grad():
         response = operator.diffuse(_tensor(lobes.sharpness, operator), _tensor(nz, operator))
-        shadowed = larger * apply_shadows(response, block, rows, lobes).double().numpy()
-        return shadowed if block.detail is None else shadowed * block.detail[rows][:, None]
+        return larger * apply_shadows(response, block, rows, lobes).double().numpy()
 
 
 def specular_response(
@@ -287,7 +286,6 @@ class ResponseCache:
         optional = (
             block.visibility,
             block.directions,
-            block.detail,
             block.place if lobes.curvature else None,
             fixed_roughness,
         )

@@ -5,7 +5,8 @@ shows the nodes v_1, v_2, v_3 with barycentric coordinates b_k has the normal
 
     n' = unit(n + P R Σ_k b_k δ_{v_k}),     R: light's frame from object's, P = 1 − n nᵀ                             (1)
 
-A node may also have a log factor on the diffuse reflectance: patina, grain, dirt.  Both are unknowns x of a node.
+A node may also have a log factor on the diffuse reflectance of each channel: patina, grain, dirt.  Both are unknowns x
+of a node.
 
 Let r be the residuals of one light, in σ, weighted by the robust loss and divided by √T.  Let J = ∂r/∂x, U = ∂r/∂u, and
 H = UᵀU + Q_u the Hessian of that light with the gradient g.  Lights respond to a step dx by −H⁻¹(Uᵀ J dx + g).  With
@@ -77,9 +78,9 @@ class SurfacePositions(msgspec.Struct, frozen=True):
         rows, columns = (np.broadcast_to(index, values.shape).reshape(-1) for index in (rows, columns))
         return csr_array((values.reshape(-1), (rows, columns)), (3 * len(self.node), 3 * nodes))
 
-    def factor(self, log_factor: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
+    def factor(self, log_factor: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the factor on the diffuse reflectance of each observation."""
-        return np.exp(np.sum(self.share * log_factor[self.node], axis=1))
+        return np.exp(np.einsum("nk,nkc->nc", self.share, log_factor[self.node]))
 
     def turn_normals(
         self, normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "v 3"]
@@ -205,11 +206,11 @@ class Detail(msgspec.Struct, frozen=True):
 
     Attributes:
         turn: δ of the normals.
-        log_factor: Logarithm of a factor on diffuse reflectance.
+        log_factor: Logarithm of a factor on diffuse reflectance, per channel.
     """
 
     turn: Float[np.ndarray, "v 3"]
-    log_factor: Float[np.ndarray, " v"]
+    log_factor: Float[np.ndarray, "v 3"]
 
     def apply_to(self, block: Block, attached: SurfacePositions) -> Block:
         """Return the block, which has no detail, with this detail."""
@@ -219,14 +220,14 @@ class Detail(msgspec.Struct, frozen=True):
 
 def zero_detail(nodes: int) -> Detail:
     """Return the detail of the mesh itself, all zero."""
-    return Detail(np.zeros((nodes, 3)), np.zeros(nodes))
+    return Detail(np.zeros((nodes, 3)), np.zeros((nodes, 3)))
 
 
 class LightTerms(msgspec.Struct, frozen=True, dict=True):
     """Terms of one light in (2).
 
     Attributes:
-        slopes: J [3n, 4v], by turns and by log factors.
+        slopes: J [3n, 6v], by turns and by log factors.
         residual: r.
         by_light: U by channel: a channel's residuals depend on its own p cells, and on q exposures and tone exponents
             that all channels share.
@@ -235,7 +236,7 @@ class LightTerms(msgspec.Struct, frozen=True, dict=True):
         cells: p.
     """
 
-    slopes: csr_array  # [3n, 4v], by turns and by log factors
+    slopes: csr_array  # [3n, 6v], by turns and by log factors
     residual: Float[np.ndarray, " 3n"]
     by_light: Float[np.ndarray, "3 n p+q"]
     hessian: Float[np.ndarray, "l l"]
@@ -319,8 +320,8 @@ def linearise_light(
     # J = [∂r/∂n R b, ∂r/∂log k_d b]
     slopes = (_normal_derivatives(illumination) * weight[:, :, None]).reshape(3 * n, 3)
     factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)
-    rows = (np.arange(3 * n).repeat(3), attached.node.repeat(3, axis=0).reshape(-1))
-    painted = csr_array((factors.reshape(-1), rows), (3 * n, nodes))
+    columns = 3 * attached.node.repeat(3, axis=0) + np.tile(np.arange(3), n)[:, None]
+    painted = csr_array((factors.reshape(-1), (np.arange(3 * n).repeat(3), columns.reshape(-1))), (3 * n, 3 * nodes))
     turning = csr_array(hstack([_block_diagonal(slopes) @ attached.operator(nodes), painted]))
     return LightTerms(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
 
@@ -378,12 +379,12 @@ def solve_detail(
         movable: Mask of the nodes whose normals may turn; None for all.
     """
     v = len(detail.log_factor)
-    unknowns = np.concatenate([detail.turn.reshape(-1), detail.log_factor])
+    unknowns = np.concatenate([detail.turn.reshape(-1), detail.log_factor.reshape(-1)])
     roughness = csr_array(laplacian + PULL_SHARE * eye_array(v))
-    # a L + b 1 for turns (three axes) and log factors, (2)
-    prior = block_diag([kron((stiffness.turn or 0) * roughness, np.eye(3)), (stiffness.factor or 0) * roughness])
+    # a L + b 1 for turns (three axes) and log factors (three channels), (2)
+    prior = block_diag([kron((a or 0) * roughness, np.eye(3)) for a in (stiffness.turn, stiffness.factor)])
     turning = np.repeat(np.ones(v, bool) if movable is None else movable, 3) & (stiffness.turn is not None)
-    free = np.append(turning, np.full(v, stiffness.factor is not None))
+    free = np.append(turning, np.full(3 * v, stiffness.factor is not None))
     slopes = [part.slopes[:, free] for part in parts]
     prior = prior.tocsr()[free][:, free]
     # −gradient, and the diagonal of the Hessian for the Jacobi preconditioner
@@ -403,4 +404,4 @@ def solve_detail(
         LinearOperator(size, system, dtype=float), target, rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
     )
     unknowns[free] += step
-    return Detail(unknowns[: 3 * v].reshape(-1, 3), unknowns[3 * v :])
+    return Detail(*unknowns.reshape(2, v, 3))

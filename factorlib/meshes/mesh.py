@@ -24,7 +24,7 @@ class Mesh(msgspec.Struct, frozen=True):
     normals     [V, 3] float64, unit, smooth
     face_label  [F] int16, material label k = position in the dataset's `materials`, from 1
     open        True if the surface has a border, so that its inside can be visible
-    detail      [V] factor on the diffuse reflectance of the material; None: 1
+    detail      [V, 3] factor on the diffuse reflectance of the material; None: 1
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -32,7 +32,7 @@ class Mesh(msgspec.Struct, frozen=True):
     normals: Float[np.ndarray, "v 3"]
     face_label: Int[np.ndarray, " f"]
     open: bool = False
-    detail: Float[np.ndarray, " v"] | None = None
+    detail: Float[np.ndarray, "v 3"] | None = None
 
     @property
     def labels(self) -> tuple[int, ...]:

@@ -82,7 +82,7 @@ class MeshCache:
         materials: Sequence[str],
         crease_deg: float,
         displacements: Mapping[str, Sequence[float]] = {},
-        log_factors: Mapping[str, Sequence[float]] = {},
+        log_factors: Mapping[str, Sequence[tuple[float, float, float]]] = {},
     ):
         self.path = path
         self.materials = materials

@@ -45,12 +45,12 @@ class PointEffects(msgspec.Struct, frozen=True):
     Attributes:
         visibility: visibility of the directions of `fibonacci_sphere(k)`, 0 hidden to 255 visible; None is all visible
         place: position relative to the middle, as `factorlib.light.distance` takes it; None is the middle
-        detail: factor on the diffuse reflectance; None is 1
+        detail: factor on the diffuse reflectance, per channel; None is 1
     """
 
     visibility: UInt8[np.ndarray, "n k"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
-    detail: Float[np.ndarray, " n"] | None = None
+    detail: Float[np.ndarray, "n 3"] | None = None
 
 
 class Reflector:
@@ -106,7 +106,7 @@ class Reflector:
         views: Float[Tensor, "n 3"],
         visibility: Float[Tensor, "n k"] | None,
         place: Float[Tensor, "n 3"] | None,
-        detail: Float[Tensor, " n"] | None,
+        detail: Float[Tensor, "n 3"] | None,
     ) -> Float[Tensor, "n 3"]:
         parts = material.diffuse, material.specular, material.roughness
         kd, ks, roughness = (torch.tensor(part, dtype=self.operator.dtype) for part in parts)
@@ -128,7 +128,7 @@ class Reflector:
         # diffuse part plus specular part, summed over lobes
         radiance = kd * ((shares[0] * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
         if detail is not None:
-            radiance = radiance * detail[:, None]
+            radiance = radiance * detail
         if bool(ks.any()):
             specular = self.operator.specular(roughness, self.sharpness, no, nz, oz)
             radiance = radiance + ks * ((shares[1] * specular) @ self.weight)
@@ -171,7 +171,7 @@ def resynthesise(
         reflector: the light
         materials: label k is materials[k − 1]
         photo: channel label
-        geometry: channels normal.x/y/z, view.x/y/z and, if diffuse reflectance has detail, detail
+        geometry: channels normal.x/y/z, view.x/y/z and, if diffuse reflectance has detail, detail.R/G/B
         report: receives the number of pixels done and their total
         surroundings: occlusion and bounces; None for neither
     """
@@ -189,14 +189,16 @@ def resynthesise(
     for k, material in enumerate(materials, start=1):
         pixels = label == k
         normals, views = (_unit(vectors[pixels].astype(float)) for vectors in (normal, view))
-        detail = geometry["detail"][pixels].astype(float) if "detail" in geometry else np.ones(len(normals))
+        detail = np.ones((len(normals), 3))
+        if "detail.R" in geometry:
+            detail = np.stack([geometry[f"detail.{channel}"][pixels] for channel in "RGB"], axis=-1).astype(float)
         visibility, bounced, place = nearest_surroundings(surroundings, k - 1, *np.nonzero(pixels))
         radiance = reflector(material, normals, views, report_pixels, PointEffects(visibility, place, detail))
         # radiance of bounces: k_d G_d + k_s G_s
         if bounced is not None:
             diffuse = bounced[:, :3]
             specular = bounced[:, 3:]
-            bounced = np.array(material.diffuse) * detail[:, None] * diffuse + np.array(material.specular) * specular
+            bounced = np.array(material.diffuse) * detail * diffuse + np.array(material.specular) * specular
             radiance += bounced * (np.sum(normals * views, 1, keepdims=True) > 0)
         picture[pixels] = radiance
         before += int(pixels.sum())

@@ -231,7 +231,9 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[di
         }
         panels |= {f"normals, {kind}": 0.5 + 0.5 * n * (1, -1, -1) for kind, n in normals.items()}
         if mesh in table.log_factors:
-            panels["detail of reflectance"] = srgb_encode(np.clip(0.4 * maps["by shading"]["detail"], 0, 1))
+            panels["detail of reflectance"] = srgb_encode(
+                np.clip(0.4 * np.stack([maps["by shading"][f"detail.{c}"] for c in "RGB"], axis=-1), 0, 1)
+            )
         uris = {}
         box = mask_box(masks[photo])
         longest = longest_side(len(run.set.photos))

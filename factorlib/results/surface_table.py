@@ -44,7 +44,7 @@ class SurfaceTable(msgspec.Struct, frozen=True):
             surface
         displacements: by mesh: along the normal at each node of the subdivided mesh (`meshes.subdivision`), in
             units of the mesh's extent
-        log_factors: by mesh: log factor on diffuse reflectance at each node
+        log_factors: by mesh: log factor on diffuse reflectance at each node, per channel
     """
 
     moved: bool = False
@@ -53,7 +53,7 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     painted_by: DetailEvidence = DetailEvidence()
     gains: dict[str, float] = {}
     displacements: dict[str, list[float]] = {}
-    log_factors: dict[str, list[float]] = {}
+    log_factors: dict[str, list[tuple[float, float, float]]] = {}
 
 
 def read_surface(folder: str | Path | None) -> SurfaceTable:

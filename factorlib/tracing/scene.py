@@ -65,12 +65,12 @@ def bsdf(material: Reflectance, painted: bool = False) -> dict[str, Any]:
     return {"type": "blendbsdf", "weight": share, "bsdf_0": lambertian, "bsdf_1": conductor}
 
 
-def paint(material: Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+def paint(material: Reflectance, detail: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """Return the vertex colours for `bsdf` of a mesh with `detail`, at most 1.
 
     Mitsuba's diffuse BSDF has no reflectance above 1.
     """
-    return np.minimum(detail[:, None] * np.array(material.mixture[1]), 1.0)
+    return np.minimum(detail * np.array(material.mixture[1]), 1.0)
 
 
 def rgb(value: float | Sequence[float] | Float[np.ndarray, "3"]) -> dict[str, Any]:

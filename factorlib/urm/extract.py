@@ -98,7 +98,7 @@ def extract_observations(
 
 
 def read_geometry(align: Path, surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
-    """Read the maps that `align` wrote of a photo; those of `surface` replace its normals and add the channel `detail`.
+    """Read the maps that `align` wrote of a photo; those of `surface` replace its normals and add detail.R, G, B.
 
     Args:
         align: Folder of the stage `align`.
@@ -132,7 +132,8 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
         )
     normal = np.stack([maps[f"normal.{axis}"][observations.y, observations.x] for axis in "xyz"], axis=-1)
     known = (normal != 0).any(1, keepdims=True)
-    detail = np.where(known[:, 0], maps["detail"][observations.y, observations.x], 1.0).astype(np.float32)
+    detail = np.stack([maps[f"detail.{channel}"][observations.y, observations.x] for channel in "RGB"], axis=-1)
+    detail = np.where(known, detail, 1.0).astype(np.float32)
     normal = np.where(known, normal, observations.normal).astype(np.float32)
     return msgspec.structs.replace(observations, normal=normal, detail=detail)
 

@@ -84,7 +84,7 @@ class Observations(msgspec.Struct, frozen=True):
     exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
-    detail: Float[np.ndarray, " n"] | None = None  # factor on diffuse reflectance by `surface`, never written; None: 1
+    detail: Float[np.ndarray, "n 3"] | None = None  # factor on diffuse reflectance, never written; None: 1
 
     def __len__(self) -> int:
         return len(self.weight)

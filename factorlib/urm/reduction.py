@@ -42,7 +42,7 @@ def merge(observations: Observations, degrees: float) -> Observations:
     flags = observations.clipped @ np.array([1, 2, 4])
     cells = [direction_cells(observations.normal, cell), direction_cells(mirror, 2 * cell)]
     if observations.detail is not None:
-        cells.append(np.rint(np.log(np.maximum(observations.detail, 1e-3)) / DETAIL_CELL).astype(np.int64)[:, None])
+        cells.append(np.rint(np.log(np.maximum(observations.detail, 1e-3)) / DETAIL_CELL).astype(np.int64))
     if (visibility := observations.visibility) is not None:  # mean of hidden × direction
         directions = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
         chunks = (visibility[i : i + ROWS] for i in range(0, len(visibility), ROWS))
@@ -54,19 +54,18 @@ def merge(observations: Observations, degrees: float) -> Observations:
     total = np.bincount(group, weight)
 
     changed = {"weight": total.astype("f4")}
-    for name in ("normal", "view", "radiance", "place"):
+    for name in ("normal", "view", "radiance", "place", "detail"):
         if (values := getattr(observations, name)) is None:
             continue
         mean = np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
-        length = 1 if name in ("radiance", "place") else np.linalg.norm(mean, axis=-1, keepdims=True)
+        length = 1 if name in ("radiance", "place", "detail") else np.linalg.norm(mean, axis=-1, keepdims=True)
         changed[name] = (mean / length).astype("f4")
     if visibility is not None:
         averaging = csr_array(((weight / total[group]).astype("f4"), (group, np.arange(len(group)))))
         columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]
         changed["visibility"] = np.rint(np.clip(np.hstack(columns), 0, 255)).astype("u1")
-    for name in ("confidence", "detail"):
-        if (values := getattr(observations, name)) is not None:
-            changed[name] = (np.bincount(group, weight * values) / total).astype("f4")
+    if observations.confidence is not None:
+        changed["confidence"] = (np.bincount(group, weight * observations.confidence) / total).astype("f4")
     return msgspec.structs.replace(observations.take(first), **changed)
 
 

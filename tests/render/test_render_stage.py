@@ -126,7 +126,9 @@ def test_a_surface_with_other_normals_and_detail_is_rendered_as_it_is(inputs, tm
     pictures = []
     for name, detail in (("plain", 1.0), ("painted", 0.5)):
         (tmp_path / name / "photos").mkdir(parents=True)
-        channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {"detail": detail * inside}
+        channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {
+            f"detail.{c}": detail * inside for c in "RGB"
+        }
         write_exr(tmp_path / name / "photos" / "front.exr", channels)
         on = msgspec.structs.replace(inputs, folders={**inputs.folders, "surface": tmp_path / name})
         pictures.append(read_rgb_exr(run(on, "front", tmp_path / f"out {name}") / "resynthesis" / "front.exr"))
@@ -226,13 +228,13 @@ def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():
 
 def test_detail_is_a_factor_on_the_diffuse_part_alone():
     reflector, (normals, views) = Reflector(reflection_operator("network"), light()), points(40)
-    detail, black = np.linspace(0.2, 2.0, 40), (0.0, 0.0, 0.0)
+    detail, black = np.linspace(0.2, 2.0, 120).reshape(40, 3), (0.0, 0.0, 0.0)
     diffuse, specular = (Reflectance(kd, ks, 0.4) for kd, ks in ((GLOSSY.diffuse, black), (black, GLOSSY.specular)))
     parts = [reflector(of, normals, views) for of in (diffuse, specular)]
-    expected = detail[:, None] * parts[0] + parts[1]
+    expected = detail * parts[0] + parts[1]
     np.testing.assert_allclose(
         reflector(GLOSSY, normals, views, effects=PointEffects(detail=detail)), expected, rtol=0.03, atol=1e-3
     )
     np.testing.assert_allclose(
-        reflector(diffuse, normals, views, effects=PointEffects(detail=detail)), detail[:, None] * parts[0], rtol=1e-5
+        reflector(diffuse, normals, views, effects=PointEffects(detail=detail)), detail * parts[0], rtol=1e-5
     )

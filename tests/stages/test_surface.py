@@ -38,7 +38,7 @@ def written(folder) -> None:
     normal = np.tile([0.6, 0.0, -0.8], (SIZE, SIZE, 1))
     normal[0] = 0
     detail = np.where(np.arange(SIZE) < SIZE // 2, 0.5, 1.0) * np.ones((SIZE, 1))
-    channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {"detail": detail}
+    channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {f"detail.{c}": detail for c in "RGB"}
     (folder / "photos").mkdir(parents=True)
     write_exr(folder / "photos" / "a.exr", channels)
 
@@ -56,9 +56,9 @@ def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tm
         {f"normal.{a}": np.ones((SIZE, SIZE)) for a in "xyz"} | {"depth": np.ones((SIZE, SIZE))},
     )
     maps = read_geometry(tmp_path / "align", tmp_path / "surface", "a")
-    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", "detail"}
+    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", *(f"detail.{c}" for c in "RGB")}
     assert maps["normal.x"][3, 3] == np.float32(0.6)
-    assert "detail" not in read_geometry(tmp_path / "align", None, "a")
+    assert "detail.R" not in read_geometry(tmp_path / "align", None, "a")
     assert (
         with_surface_normals(observations(), None) is not None
         and with_surface_normals(observations(), None).detail is None
@@ -71,9 +71,9 @@ def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(
     written(tmp_path / "surface")
     write_observations(tmp_path / "a.parquet", observations())
     (photo,) = gather_observations([tmp_path / "a.parquet"], 2.0, serial_map, tmp_path / "surface")
-    assert sorted(set(photo.merged.detail.tolist())) == [0.5, 1.0]
+    assert np.unique(photo.merged.detail).tolist() == [0.5, 1.0]
     (block,) = blocks_of_observations(photo.merged, Noise())
-    assert np.array_equal(np.sort(block.detail), np.sort(photo.merged.detail))
+    assert np.array_equal(np.sort(block.detail, 0), np.sort(photo.merged.detail, 0))
     plain = msgspec.structs.replace(photo.merged, detail=None)
     assert blocks_of_observations(plain, Noise())[0].detail is None
 
@@ -87,8 +87,8 @@ def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
 def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     write_ply(tmp_path / "ball.ply", sphere(1.0))
     dense = subdivided_mesh(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
-    table = {"ball": np.full(dense.nodes, 0.05).tolist()}
-    once = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, table, table)
+    moves, factors = ({"ball": np.full(shape, 0.05).tolist()} for shape in (dense.nodes, (dense.nodes, 3)))
+    once = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, moves, factors)
     mesh = once.mesh("ball", MeshEntry("ball.ply", material="red"))
     radius = np.linalg.norm(mesh.vertices, axis=1).max()
     assert abs(radius - 1 - 0.05 * dense.extent) < 1e-3 and np.allclose(mesh.detail, np.exp(0.05))
