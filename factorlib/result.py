@@ -101,7 +101,7 @@ def load_result(folder: str | Path) -> Result:
             cure=did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one",
         )
     check_whole(result, STAGES)
-    stages = [stage for stage in (*STAGES, "shapes", "surface") if (result / stage).is_dir()]
+    stages = [stage for stage in (*STAGES, "shapes", "surface", "texture") if (result / stage).is_dir()]
     folders = {stage: (result / stage).resolve() for stage in stages}
     file = result / "export" / "dataset.json"
     source = folders["export"] / "source"

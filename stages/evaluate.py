@@ -107,7 +107,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def _read_photo(inputs: Inputs, name: str) -> ComparedPhoto:
     """Return a photo and its re-synthesis."""
     photo = read_exr(inputs["masks"] / f"{name}.exr")
-    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
+    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name, inputs.folders.get("texture"))
     return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
 
@@ -163,7 +163,7 @@ def _lights(
 
 def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return normals and view directions [h, w, 3] of a photo, in its camera frame, and its observed pixels [h, w]."""
-    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
+    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name, inputs.folders.get("texture"))
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     return normal, view, observed_pixels(read_exr(inputs["masks"] / f"{name}.exr"), geometry)
 

@@ -17,14 +17,12 @@ from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import apply_tone
-from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
-from factorlib.render.resynthesis import Reflector, Surroundings, observed_cells, render_balls, resynthesise
+from factorlib.render.resynthesis import Reflector, observed_cells, read_surroundings, render_balls, resynthesise
 from factorlib.results.lobe_table import read_photo_light
-from factorlib.results.materials import Gauge, Model, read_materials, select_materials
+from factorlib.results.materials import read_materials, select_materials
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import observed_pixels, read_geometry, with_surface_normals
-from factorlib.urm.observations import read_observations
+from factorlib.urm.extract import observed_pixels, read_geometry
 
 Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
 RING = (255, 255, 255)
@@ -50,7 +48,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     exported = read_materials(file)
     model = read_materials(inputs["solve"] / "materials.json").model
     photo = read_exr(inputs["masks"] / f"{name}.exr")
-    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
+    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name, inputs.folders.get("texture"))
     slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
     light = read_photo_light(inputs["export"], name, slice_)
     operator = reflection_operator(params.operator, weights=inputs["train"])
@@ -63,7 +61,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         """Report progress of the re-synthesis, in pixels."""
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
-    around = surroundings(inputs, model, exported.gauge)
+    urm = inputs["urm"] / f"{name}.parquet"
+    around = read_surroundings(urm, inputs.folders.get("surface"), model, exported.gauge.export_factor or 1.0)
     radiance = resynthesise(reflector, materials, photo, geometry, report, around)
     if tone := model.tone.get(name):
         radiance = apply_tone(radiance, tone.exponent, tone.pivot)
@@ -78,24 +77,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         cells = observed_cells(np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1), params.map_size)
         _write(out / "reflectance_maps" / name / label, reflectance_map, exposure, ball=True, observed=cells)
     progress(total, total, name)
-
-
-def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | None:
-    """Return visibility, bounced radiance and positions of the photo's observations; None if the model uses none.
-
-    Args:
-        inputs: Inputs of the stage.
-        model: Effects that the solve included.
-        gauge: Gauge of the rendered materials.  Its factor divides bounced radiance, as it divides exported lights.
-    """
-    if not (model.self_shadowing or model.distance):
-        return None
-    table = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
-    table = with_surface_normals(table, inputs.folders.get("surface"))
-    if not model.self_shadowing:
-        table = msgspec.structs.replace(table, visibility=None, occluder=None)
-    bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None
-    return Surroundings(table, None if bounced is None else bounced / (gauge.export_factor or 1.0))
 
 
 def _write(stem: Path, radiance: np.ndarray, exposure: float, ball: bool, observed: np.ndarray | None = None) -> None:

@@ -13,20 +13,18 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from jaxtyping import Int
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, solved_photos
-from factorlib.images.exr import read_exr, write_exr
+from factorlib.images.exr import write_exr
+from factorlib.inference.aligned_photo import read_aligned_photos, visible_meshes
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, usable_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
 from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
 from factorlib.inference.surface_turns import (
-    Detail,
     SurfacePositions,
     Surfaces,
-    attach_pixels,
     concatenate_positions,
     zero_detail,
 )
@@ -34,11 +32,8 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
-from factorlib.results.poses import FILE as POSES
-from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface_table import BEGINNING, FILE, DetailEvidence, SurfaceTable
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (
     Observations,
     at_one_exposure,
@@ -65,8 +60,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_json(out / FILE, SurfaceTable())
         return
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
-    photos = _photos(inputs, slices)
-    surfaces = read_surfaces(inputs, slices)
+    photos = read_aligned_photos(inputs, slices)
+    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    surfaces = Surfaces({name: subdivided_mesh(mesh) for name, mesh in visible_meshes(read, slices).items()})
     if not surfaces.meshes:
         write_json(out / FILE, SurfaceTable())
         return
@@ -103,62 +99,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
     progress(1, 1)
-
-
-class AlignedPhoto(msgspec.Struct, frozen=True):
-    """Photo as written by `align`: its maps, its objects and their poses."""
-
-    geometry: Channels
-    objects: ObjectsSlice
-    poses: PhotoPoses
-
-    def attach(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> SurfacePositions:
-        """Return the positions of pixels (x, y) on the surfaces."""
-        height, width = self.geometry["object"].shape
-        objects = {entry.name: (entry.mesh, self.poses.objects[entry.name]) for entry in self.objects.objects}
-        object_number = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
-        return attach_pixels(pixels, object_number, self.poses.camera.camera(width, height), objects, surfaces)
-
-    def detail_channels(self, surfaces: Surfaces, detail: Detail) -> Channels:
-        """Return normal.x, .y, .z (camera frame) and detail.R, .G, .B (factor on the diffuse reflectance).
-
-        All are 0 at pixels without a mesh.
-        """
-        y, x = np.nonzero(self.geometry["object"] > 0.5)
-        normal, view = (
-            np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
-            for kind in ("normal", "view")
-        )
-        attached = self.attach(np.column_stack([x, y]), surfaces)
-        picture = np.zeros((*self.geometry["object"].shape, 6), np.float32)
-        picture[y, x, :3] = attached.turn_normals(normal, view, detail.turn)
-        picture[y, x, 3:] = attached.factor(detail.log_factor)
-        names = [*(f"normal.{axis}" for axis in "xyz"), *(f"detail.{channel}" for channel in "RGB")]
-        return dict(zip(names, np.moveaxis(picture, -1, 0)))
-
-
-def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, AlignedPhoto]:
-    """Return all photos as written by `align`, sorted by name."""
-    poses = read_poses(inputs["align"] / POSES)
-    return {
-        name: AlignedPhoto(read_exr(inputs["align"] / f"{name}.exr"), slices[name], poses[name])
-        for name in sorted(slices)
-    }
-
-
-def read_surfaces(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
-    """Return the subdivided meshes that photos show.
-
-    Bodies of revolution that were estimated from outlines are left out, because their rotation about the axis is
-    unknown.  Objects may give the parts of a mesh different materials; vertices do not depend on them.
-    """
-    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
-    meshes = {}
-    for slice_ in slices.values():
-        for entry in slice_.objects:
-            if entry.mesh not in meshes and not slice_.meshes[entry.mesh].is_revolved:
-                meshes[entry.mesh] = subdivided_mesh(read.mesh(entry.mesh, slice_.meshes[entry.mesh], entry.materials))
-    return Surfaces(dict(sorted(meshes.items())))
 
 
 def draw_observations(file: Path, params: Params) -> Observations:

@@ -13,6 +13,7 @@ from factorlib.meshes.read_mesh import MeshCache
 from factorlib.results.materials import Reflectance
 from factorlib.results.poses import ObjectPose
 from factorlib.results.surface_table import read_surface
+from factorlib.results.texture_table import read_textures
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import paint, rigid
 
@@ -42,7 +43,8 @@ class MeshFiles:
         self.materials = materials
         self.solved = solved
         surface = read_surface(inputs.folders.get("surface"))
-        self.read = MeshCache(inputs.mesh, materials, crease_deg, surface.displacements, surface.log_factors)
+        textures = read_textures(inputs.folders.get("texture"))
+        self.read = MeshCache(inputs.mesh, materials, crease_deg, surface.displacements, surface.log_factors, textures)
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 
     def shapes(

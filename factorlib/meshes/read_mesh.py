@@ -6,11 +6,12 @@ give a wrong result raise InputError.
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
@@ -18,7 +19,7 @@ from factorlib.meshes.gltf_mesh import read_gltf
 from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipped_faces, weld_vertices
 from factorlib.meshes.obj import read_obj
 from factorlib.meshes.ply_stl_off import read_off, read_ply, read_stl
-from factorlib.meshes.subdivision import subdivided_mesh
+from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
 from factorlib.meshes.triangle_soup import NO_LIMITS, Limits, TriangleSoup, check_soup
 from factorlib.reading import one_line, read_bytes, reading
 
@@ -74,6 +75,7 @@ class MeshCache:
     crease_deg      crease angle, as in `read_mesh`
     displacements   by mesh, displacements at the nodes that `surface` estimated; the mesh is subdivided and moved
     log_factors     by mesh, logarithms of the detail at the nodes that `surface` estimated
+    textures        by mesh, longest edge of the subdivided mesh, and factors at its nodes by material, from `texture`
     """
 
     def __init__(
@@ -83,12 +85,14 @@ class MeshCache:
         crease_deg: float,
         displacements: Mapping[str, Sequence[float]] = {},
         log_factors: Mapping[str, Sequence[tuple[float, float, float]]] = {},
+        textures: Mapping[str, tuple[float, Mapping[str, Float[np.ndarray, "v 3"]]]] = {},
     ):
         self.path = path
         self.materials = materials
         self.crease_deg = crease_deg
         self.displacements = displacements
         self.log_factors = log_factors
+        self.textures = textures
         self._meshes: dict[tuple, Mesh] = {}
 
     def mesh(self, name: str, entry: MeshEntry, overrides: Mapping[str, str] = {}) -> Mesh:
@@ -113,16 +117,32 @@ class MeshCache:
                 dense = subdivided_mesh(mesh)
                 still = np.zeros(dense.nodes)
                 moves, factors = (np.array(table.get(name, still)) for table in (self.displacements, self.log_factors))
-                if not len(moves) == len(factors) == dense.nodes:
-                    raise InputError(
-                        "this is not the mesh whose surface the stage `surface` estimated",
-                        file=file,
-                        cure="run `surface` again",
-                    )
+                _check_nodes([moves, factors], dense, file, "surface")
                 detail = np.exp(factors)[dense.node] if name in self.log_factors else None
                 mesh = msgspec.structs.replace(dense.displace(moves), detail=detail)
-            self._meshes[key] = mesh
+            self._meshes[key] = self._textured(mesh, name, file)
         return self._meshes[key]
+
+    def _textured(self, mesh: Mesh, name: str, file: Path) -> Mesh:
+        """Return the mesh `name` of a file, subdivided, with its textures as detail; itself if it has none."""
+        longest, factors = self.textures.get(name, (0.0, {}))
+        labels = [label for label in mesh.labels if self.materials[label - 1] in factors]
+        if not labels:
+            return mesh
+        fine = subdivided_mesh(mesh, longest)
+        _check_nodes(factors.values(), fine, file, "texture")
+        detail = np.ones((len(fine.mesh.vertices), 3)) if fine.mesh.detail is None else fine.mesh.detail.copy()
+        for label in labels:
+            vertices = np.unique(fine.mesh.faces[fine.mesh.face_label == label])
+            detail[vertices] = factors[self.materials[label - 1]][fine.node[vertices]]
+        return msgspec.structs.replace(fine.mesh, detail=detail)
+
+
+def _check_nodes(values: Iterable[np.ndarray], mesh: SubdividedMesh, file: Path, stage: str) -> None:
+    """Check that there is one value for each node, as a stage estimated them; InputError otherwise."""
+    if any(len(one) != mesh.nodes for one in values):
+        fault = f"this is not the mesh whose surface the stage `{stage}` estimated"
+        raise InputError(fault, file=file, cure=f"run `{stage}` again")
 
 
 def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:

@@ -22,8 +22,9 @@ UNSEEN = 0.05  # weight of the gradient where no photo sees the surface
 def subdivide(mesh: Mesh, longest: float) -> Mesh:
     """Subdivide the mesh until every edge is at most `longest` long, in units of the mesh.
 
-    New vertices lie on the old triangles and have interpolated normals.
+    New vertices lie on the old triangles and have interpolated normals and detail.
     """
+    detail = mesh.detail
     vertices = mesh.vertices
     normals = mesh.normals
     faces = mesh.faces.astype(np.int64)
@@ -32,9 +33,8 @@ def subdivide(mesh: Mesh, longest: float) -> Mesh:
         ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)  # edge k goes from corner k to the next
         too_long = np.linalg.norm(vertices[ends[..., 0]] - vertices[ends[..., 1]], axis=-1) > longest
         if not too_long.any():
-            return msgspec.structs.replace(
-                mesh, vertices=vertices, normals=normals, faces=faces.astype(np.int32), face_label=label
-            )
+            moved = {"vertices": vertices, "normals": normals, "detail": detail}
+            return msgspec.structs.replace(mesh, faces=faces.astype(np.int32), face_label=label, **moved)
         # one new vertex at the midpoint of every long edge, with the mean normal of its ends
         pairs, number = np.unique(np.sort(ends[too_long], axis=1), axis=0, return_inverse=True)
         middle = np.full(faces.shape, -1)
@@ -44,6 +44,7 @@ def subdivide(mesh: Mesh, longest: float) -> Mesh:
         middle_normals = np.where(length > 1e-9, middle_normals / np.maximum(length, 1e-9), normals[pairs[:, 0]])
         vertices = np.vstack([vertices, vertices[pairs].mean(1)])
         normals = np.vstack([normals, middle_normals])
+        detail = None if detail is None else np.vstack([detail, detail[pairs].mean(1)])
         count = too_long.sum(1)
         parts = [faces[~too_long.any(1)]]
         labels = [label[~too_long.any(1)]]
@@ -166,9 +167,9 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self.mesh, vertices=place, normals=normal)
 
 
-def subdivided_mesh(mesh: Mesh) -> SubdividedMesh:
-    """Subdivide a mesh until no edge is longer than `LONGEST` times its extent, and number its nodes."""
+def subdivided_mesh(mesh: Mesh, longest: float = LONGEST) -> SubdividedMesh:
+    """Subdivide a mesh until no edge is longer than `longest` times its extent, and number its nodes."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-    dense = subdivide(mesh, LONGEST * extent)
+    dense = subdivide(mesh, longest * extent)
     node = weld_vertices(dense.vertices)
     return SubdividedMesh(dense, node, node[dense.faces], extent)

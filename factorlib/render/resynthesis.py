@@ -11,6 +11,7 @@ right, y down, z forward); a ball's view is (0, 0, −1).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -23,12 +24,14 @@ from torch import Tensor
 
 from factorlib.conventions import FRONT
 from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
+from factorlib.inference.interreflection import bounced_light
 from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.lobes import Lobes
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
 from factorlib.reflection import Operator
-from factorlib.results.materials import Reflectance
-from factorlib.urm.observations import Observations
+from factorlib.results.materials import Model, Reflectance
+from factorlib.urm.extract import with_surface_normals
+from factorlib.urm.observations import Observations, read_observations
 
 PAIRS_AT_ONCE = 1 << 18  # pairs of a point and a lobe in one batch
 
@@ -155,6 +158,24 @@ class Surroundings(msgspec.Struct, frozen=True):
 
     observations: Observations
     bounced: Float[np.ndarray, "n 6"] | None = None
+
+
+def read_surroundings(urm: Path, surface: Path | None, model: Model, factor: float = 1.0) -> Surroundings | None:
+    """Read visibility, bounced radiance and positions of a photo's observations; None if the model uses none.
+
+    Args:
+        urm: file of the photo's observations
+        surface: folder of the stage `surface`, if any
+        model: effects that the solve included
+        factor: factor of the gauge of the rendered materials; it divides bounced radiance, as it divides lights
+    """
+    if not (model.self_shadowing or model.distance):
+        return None
+    table = with_surface_normals(read_observations(urm), surface)
+    if not model.self_shadowing:
+        table = msgspec.structs.replace(table, visibility=None, occluder=None)
+    bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None
+    return Surroundings(table, None if bounced is None else bounced / factor)
 
 
 def resynthesise(

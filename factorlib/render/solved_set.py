@@ -26,6 +26,7 @@ from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface_table import read_surface
+from factorlib.results.texture_table import read_textures
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import rigid
 
@@ -62,7 +63,9 @@ class SolvedSet:
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
         surface = read_surface(inputs.folders.get("surface"))
-        self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, surface.displacements, surface.log_factors)
+        textures = read_textures(inputs.folders.get("texture"))
+        moved = surface.displacements, surface.log_factors
+        self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, *moved, textures)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:

@@ -18,8 +18,9 @@ from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface_table import SurfaceTable, read_surface
+from factorlib.results.texture_table import TextureTable, read_table
 
-STAGES = ["masks", "align", "urm", "surface", "train", "solve", "export", "render", "evaluate"]
+STAGES = ["masks", "align", "urm", "surface", "train", "solve", "texture", "export", "render", "evaluate"]
 
 T = TypeVar("T")
 Channels = dict[str, Float[np.ndarray, "h w"]]
@@ -83,6 +84,11 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
     def surface(self) -> SurfaceTable:
         """Refinements of the meshes from `surface`; none if there is no such result."""
         return read_surface(self.folders.get("surface"))
+
+    @cached_property
+    def texture(self) -> TextureTable:
+        """Albedo textures from `texture`; none if there is no such result."""
+        return read_table(self.folders.get("texture"))
 
     @cached_property
     def solved(self) -> MaterialTable:

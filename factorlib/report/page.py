@@ -77,6 +77,7 @@ def page(
         cells=cells,
         maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
         surface=run.surface,
+        texture=run.texture,
         surfaces=surfaces,
         training=_training(run),
         cost=stage_costs(run.events(), STAGES),

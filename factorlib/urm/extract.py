@@ -97,18 +97,23 @@ def extract_observations(
     )
 
 
-def read_geometry(align: Path, surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
-    """Read the maps that `align` wrote of a photo; those of `surface` replace its normals and add detail.R, G, B.
+def read_geometry(
+    align: Path, surface: Path | None, photo: str, texture: Path | None = None
+) -> dict[str, Float[np.ndarray, "h w"]]:
+    """Read the maps that `align` wrote of a photo.
+
+    Normals of `surface` replace them, and its detail.R, G, B are added; those of `texture` replace these.
 
     Args:
         align: Folder of the stage `align`.
         surface: Folder of the stage `surface`, if any.
         photo: Name of the photo.
+        texture: Folder of the stage `texture`, if any.
 
     Returns:
         Channels by name.
     """
-    return {**read_exr(align / f"{photo}.exr"), **_normals(surface, photo)}
+    return {**read_exr(align / f"{photo}.exr"), **_photo_maps(surface, photo), **_photo_maps(texture, photo)}
 
 
 def with_surface_normals(observations: Observations, surface: Path | None) -> Observations:
@@ -119,7 +124,7 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
     Raises:
         InputError: If the maps have another size than the photo.
     """
-    if not observations.photos or not (maps := _normals(surface, observations.photos[0])):
+    if not observations.photos or not (maps := _photo_maps(surface, observations.photos[0])):
         return observations
     height, width = maps["normal.x"].shape
     if len(observations) and (observations.x.max() >= width or observations.y.max() >= height):
@@ -138,7 +143,7 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
     return msgspec.structs.replace(observations, normal=normal, detail=detail)
 
 
-def _normals(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
+def _photo_maps(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
     """Read the maps of a photo in the folder of `surface`; empty if there are none."""
     if surface is None:
         return {}

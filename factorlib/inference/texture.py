@@ -1,0 +1,156 @@
+"""Albedo texture: a factor per channel on a material's diffuse reflectance, at the nodes of a subdivided mesh.
+
+Lights, the specular part and the surface are given.  Pixel i then shows
+
+    y_i = k_d t_i D_i + S_i,      t_i = Σ_k b_ik f_{v_ik}                                                            (1)
+
+with D the diffuse radiance for k_d = 1 and S the specular radiance, both with shadows and interreflection.  f_v is the
+factor at node v, and b are barycentric coordinates.  So z_i = (y_i − S_i)/(k_d D_i) observes t_i, and f minimises
+
+    Σ_i w_i ρ(z_i − t_i) + a Σ_edges |f_v − f_w|² + ε Σ_v |f_v − 1|²                                                 (2)
+
+with ρ the pseudo-Huber loss, by reweighted least squares.  Errors of D are relative to it, and those of y are not: w =
+cosine · x²/(x² + d²), x the mean of k_d D over channels and d the share `DARK` of its mean in the photo.  Nodes that no
+pixel shows continue the ones around them.
+
+Evidence    Each photo is predicted by the texture of the others, where these see its surface.  The stiffness a with
+            the least loss is used.  The texture is kept if it predicts better than the best flat colour of the others
+            (`factorlib.inference.model_selection`).  A part in one photo alone gives no evidence: its texture would
+            only repeat that photo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse.linalg import cg
+
+from factorlib.inference.blocks import RobustLoss
+from factorlib.inference.model_selection import CLEARLY_FOR, Losses, compare_models
+from factorlib.results.materials import Decision
+
+STIFFNESSES = (3.0, 1.0, 0.3, 0.1)  # a of (2), from stiff to soft
+PULL = 1e-4  # ε of (2), which only fixes meshes that no pixel shows
+DARK = 0.2  # d, as a share of a photo's mean diffuse radiance
+LOSS = RobustLoss(0.15)  # ρ of (2)
+REWEIGHTINGS = 2  # solutions of (2) after the first one
+LARGEST_RATIO = 20.0  # largest z
+LEAST_SHARED = 0.2  # least weight of other photos' pixels about a node that counts as seen by them
+CG_TOLERANCE = 1e-5
+CG_ITERATIONS = 300
+
+
+class TextureSamples(msgspec.Struct, frozen=True):
+    """Pixels of one photo that observe a texture.
+
+    Attributes:
+        operator: b of (1).
+        ratio: z.
+        weight: w of (2).
+        cluster: Number of each pixel's cluster; residuals of one are correlated.
+    """
+
+    operator: csr_array  # [n, v]
+    ratio: Float[np.ndarray, "n 3"]
+    weight: Float[np.ndarray, " n"]
+    cluster: Int[np.ndarray, " n"]
+
+    def losses(self, factor: Float[np.ndarray, "n 3"], rows: np.ndarray) -> Float[np.ndarray, " n"]:
+        """Return the weighted robust loss of the pixels `rows` for the factors at all pixels."""
+        return (self.weight * LOSS.evaluate(self.ratio - factor).mean(1))[rows]
+
+
+def observe_texture(
+    radiance: Float[np.ndarray, "n 3"],
+    diffuse: Float[np.ndarray, "n 3"],
+    specular: Float[np.ndarray, "n 3"],
+    cosine: Float[np.ndarray, " n"],
+    positions: tuple[csr_array, Int[np.ndarray, " n"]],
+) -> TextureSamples:
+    """Return the samples of pixels with linear radiance y, of which k_d D and S are predicted.
+
+    Args:
+        radiance: y.
+        diffuse: k_d D.
+        specular: S.
+        cosine: Cosine between normal and view.
+        positions: b of (1), and the cluster of each pixel.
+    """
+    x = diffuse.mean(1)
+    dark = DARK * max(float(x.mean()), 1e-12) if len(x) else 1.0
+    weight = cosine * x**2 / (x**2 + dark**2)
+    ratio = (radiance - specular) / np.maximum(diffuse, 1e-3 * dark)
+    return TextureSamples(positions[0], ratio.clip(0, LARGEST_RATIO), weight, positions[1])
+
+
+def solve_texture(
+    samples: Sequence[TextureSamples], laplacian: csr_array, stiffness: float
+) -> Float[np.ndarray, "v 3"]:
+    """Return the factors at all nodes that minimise (2)."""
+    prior = csr_array(stiffness * laplacian + PULL * eye_array(laplacian.shape[0]))
+    factor = np.ones((laplacian.shape[0], 3))
+    weights = [sample.weight for sample in samples]
+    for _ in range(1 + REWEIGHTINGS):
+        system = prior.copy()
+        target = np.full(factor.shape, PULL)
+        for sample, weight in zip(samples, weights, strict=True):
+            weighted = csr_array(sample.operator.T @ diags_array(weight))
+            system = csr_array(system + weighted @ sample.operator)
+            target += weighted @ sample.ratio
+        preconditioner = diags_array(1 / system.diagonal())
+        for c in range(3):
+            factor[:, c] = cg(
+                system, target[:, c], x0=factor[:, c], rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
+            )[0]
+        weights = [s.weight * LOSS.weights(s.ratio - s.operator @ factor).mean(1) for s in samples]
+    return factor
+
+
+def select_texture(
+    samples: Sequence[TextureSamples], laplacian: csr_array
+) -> tuple[Float[np.ndarray, "v 3"] | None, Decision, float]:
+    """Return the texture if photos are predicted better by it, with the evidence and the stiffness.
+
+    Args:
+        samples: Pixels of each photo.
+        laplacian: Laplacian of the mesh.
+    """
+    seen = np.array([sample.operator.T @ sample.weight for sample in samples])
+    # pixels of each photo that other photos see as well
+    shared = [
+        np.flatnonzero((sample.operator @ (seen.sum(0) - own) > LEAST_SHARED) & (sample.weight > 0))
+        for sample, own in zip(samples, seen, strict=True)
+    ]
+    predicted = [k for k, rows in enumerate(shared) if len(rows)]
+    if len(samples) < 2 or not predicted:
+        return None, Decision(False), STIFFNESSES[0]
+    clusters = [np.unique(samples[k].cluster[shared[k]], return_inverse=True)[1] for k in predicted]
+    others = {k: [sample for number, sample in enumerate(samples) if number != k] for k in predicted}
+    flat = Losses([samples[k].losses(flat_colour(others[k]), shared[k]) for k in predicted], clusters)
+    best: tuple[Decision, float] | None = None
+    for stiffness in STIFFNESSES:
+        textures = [samples[k].operator @ solve_texture(others[k], laplacian, stiffness) for k in predicted]
+        losses = [samples[k].losses(t, shared[k]) for k, t in zip(predicted, textures, strict=True)]
+        evidence = compare_models(flat, Losses(losses, clusters), CLEARLY_FOR)
+        if best is not None and (evidence.held_out_loss_with or 0) >= (best[0].held_out_loss_with or 0):
+            break
+        best = evidence, stiffness
+    assert best is not None
+    texture = solve_texture(samples, laplacian, best[1]) if best[0].accepted else None
+    return texture, best[0], best[1]
+
+
+def flat_colour(samples: Sequence[TextureSamples]) -> Float[np.ndarray, "1 3"]:
+    """Return the factor of the best flat colour, the robust mean of the ratios of all pixels."""
+    ratio = np.vstack([sample.ratio for sample in samples])
+    weight = np.concatenate([sample.weight for sample in samples])
+    factor = np.ones((1, 3))
+    weights = np.repeat(weight[:, None], 3, axis=1)
+    for _ in range(1 + REWEIGHTINGS):
+        factor = ((weights * ratio).sum(0) / np.maximum(weights.sum(0), 1e-12))[None]
+        weights = weight[:, None] * LOSS.weights(ratio - factor)
+    return factor
