@@ -61,8 +61,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         """Report progress of the re-synthesis, in pixels."""
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
-    urm = inputs["urm"] / f"{name}.parquet"
-    around = read_surroundings(urm, inputs.folders.get("surface"), model, exported.gauge.export_factor or 1.0)
+    around = read_surroundings(inputs.folders, name, model, exported.gauge.export_factor or 1.0)
     radiance = resynthesise(reflector, materials, photo, geometry, report, around)
     if tone := model.tone.get(name):
         radiance = apply_tone(radiance, tone.exponent, tone.pivot)

@@ -131,7 +131,7 @@ def observe_photo(
         read_photo_light(inputs["solve"], name, light),
         table.model.curvature(light.illumination),
     )
-    around = read_surroundings(inputs["urm"] / f"{name}.parquet", inputs.folders.get("surface"), table.model)
+    around = read_surroundings(inputs.folders, name, table.model)
     bare = {channel: values for channel, values in geometry.items() if channel not in DETAIL}
     black = (0.0, 0.0, 0.0)
     parts = [

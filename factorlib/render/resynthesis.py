@@ -160,18 +160,20 @@ class Surroundings(msgspec.Struct, frozen=True):
     bounced: Float[np.ndarray, "n 6"] | None = None
 
 
-def read_surroundings(urm: Path, surface: Path | None, model: Model, factor: float = 1.0) -> Surroundings | None:
+def read_surroundings(
+    folders: Mapping[str, Path], photo: str, model: Model, factor: float = 1.0
+) -> Surroundings | None:
     """Read visibility, bounced radiance and positions of a photo's observations; None if the model uses none.
 
     Args:
-        urm: file of the photo's observations
-        surface: folder of the stage `surface`, if any
+        folders: folders of the stages `urm` and, if there is one, `surface`
+        photo: name of the photo
         model: effects that the solve included
         factor: factor of the gauge of the rendered materials; it divides bounced radiance, as it divides lights
     """
     if not (model.self_shadowing or model.distance):
         return None
-    table = with_surface_normals(read_observations(urm), surface)
+    table = with_surface_normals(read_observations(folders["urm"] / f"{photo}.parquet"), folders.get("surface"))
     if not model.self_shadowing:
         table = msgspec.structs.replace(table, visibility=None, occluder=None)
     bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None

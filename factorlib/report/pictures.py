@@ -232,7 +232,7 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[di
             f"clay, {kind}": srgb_encode(0.03 + 0.5 * np.maximum(n @ CLAY_LIGHT, 0)) for kind, n in normals.items()
         }
         panels |= {f"normals, {kind}": 0.5 + 0.5 * n * (1, -1, -1) for kind, n in normals.items()}
-        paint = {"detail of reflectance": maps.get("by shading")} if mesh in table.log_factors else {}
+        paint = {"detail of reflectance": maps["by shading"]} if mesh in table.log_factors else {}
         if mesh in run.texture.longest:
             paint = {"texture, a factor on the diffuse reflectance": run.channels("texture", f"photos/{photo}")}
         panels |= {
