@@ -1,5 +1,6 @@
 """texture.json and factors.parquet of `texture`: albedo textures of meshes, and the evidence for them."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -64,8 +65,10 @@ def write_factors(path: Path, factors: Factors) -> None:
     columns = {"mesh": pa.array([mesh for mesh, _ in keys], pa.string())}
     columns |= {"material": pa.array([material for _, material in keys], pa.string())}
     columns |= {name: pa.array(table[:, c]) for c, name in enumerate(CHANNELS)}
+    about = {"factor": "on the diffuse reflectance, at the nodes of the subdivided mesh in their order"}
+    metadata = {"factorlib": json.dumps(about, sort_keys=True)}
     with writing(path):
-        pq.write_table(pa.table(columns), path, compression="zstd")
+        pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
 
 
 def read_table(folder: str | Path | None) -> TextureTable:
