@@ -36,7 +36,7 @@ from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels, read_geometry
 
 FINEST, COARSEST = 0.004, 0.04  # range of the longest edge, in units of the mesh's extent
-EDGE_PIXELS = 1.5  # longest edge, in pixels of a typical photo
+EDGE_PIXELS = 2.0  # longest edge, in pixels of a typical photo
 CLUSTER_PIXELS = 16  # side of the blocks of pixels whose residuals are correlated
 DETAIL = ("detail.R", "detail.G", "detail.B")
 Factors = dict[tuple[str, str], Float[np.ndarray, "v 3"]]

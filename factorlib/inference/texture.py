@@ -13,7 +13,7 @@ with ρ the pseudo-Huber loss, by reweighted least squares.  Errors of D are rel
 cosine · x²/(x² + d²), x the mean of k_d D over channels and d the share `DARK` of its mean in the photo.  Nodes that no
 pixel shows continue the ones around them.
 
-Evidence    Each photo is predicted by the texture of the others, where these see its surface.  The stiffness a with
+Evidence    Each photo is predicted by the texture of others, a fold of photos at a time, where these see its surface.  The stiffness a with
             the least loss is used.  The texture is kept if it predicts better than the best flat colour of the others
             (`factorlib.inference.model_selection`).  A part in one photo alone gives no evidence: its texture would
             only repeat that photo.
@@ -33,15 +33,16 @@ from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.model_selection import CLEARLY_FOR, Losses, compare_models
 from factorlib.results.materials import Decision
 
-STIFFNESSES = (3.0, 1.0, 0.3, 0.1)  # a of (2), from stiff to soft
+STIFFNESSES = (3.0, 1.0, 0.3, 0.1, 0.03)  # a of (2), from stiff to soft
 PULL = 1e-4  # ε of (2), which only fixes meshes that no pixel shows
 DARK = 0.2  # d, as a share of a photo's mean diffuse radiance
 LOSS = RobustLoss(0.15)  # ρ of (2)
 REWEIGHTINGS = 2  # solutions of (2) after the first one
 LARGEST_RATIO = 20.0  # largest z
 LEAST_SHARED = 0.2  # least weight of other photos' pixels about a node that counts as seen by them
-CG_TOLERANCE = 1e-5
+CG_TOLERANCE = 1e-3
 CG_ITERATIONS = 300
+FOLDS = 4  # folds of photos
 
 
 class TextureSamples(msgspec.Struct, frozen=True):
@@ -88,12 +89,24 @@ def observe_texture(
 
 
 def solve_texture(
-    samples: Sequence[TextureSamples], laplacian: csr_array, stiffness: float
+    samples: Sequence[TextureSamples],
+    laplacian: csr_array,
+    stiffness: float,
+    start: Float[np.ndarray, "v 3"] | None = None,
 ) -> Float[np.ndarray, "v 3"]:
-    """Return the factors at all nodes that minimise (2)."""
+    """Return the factors at all nodes that minimise (2).
+
+    Args:
+        samples: Pixels of each photo.
+        laplacian: Laplacian of the mesh.
+        stiffness: a of (2).
+        start: Factors of another solution, from which the search begins.
+    """
     prior = csr_array(stiffness * laplacian + PULL * eye_array(laplacian.shape[0]))
-    factor = np.ones((laplacian.shape[0], 3))
+    factor = np.ones((laplacian.shape[0], 3)) if start is None else start.copy()
     weights = [sample.weight for sample in samples]
+    if start is not None:
+        weights = [s.weight * LOSS.weights(s.ratio - s.operator @ factor).mean(1) for s in samples]
     for _ in range(1 + REWEIGHTINGS):
         system = prior.copy()
         target = np.full(factor.shape, PULL)
@@ -119,22 +132,26 @@ def select_texture(
         samples: Pixels of each photo.
         laplacian: Laplacian of the mesh.
     """
+    folds = min(FOLDS, len(samples))
     seen = np.array([sample.operator.T @ sample.weight for sample in samples])
-    # pixels of each photo that other photos see as well
-    shared = [
-        np.flatnonzero((sample.operator @ (seen.sum(0) - own) > LEAST_SHARED) & (sample.weight > 0))
-        for sample, own in zip(samples, seen, strict=True)
-    ]
+    # pixels of each photo that photos of other folds see as well
+    shared = []
+    for k, sample in enumerate(samples):
+        elsewhere = seen.sum(0) - seen[k % folds :: folds].sum(0)
+        shared.append(np.flatnonzero((sample.operator @ elsewhere > LEAST_SHARED) & (sample.weight > 0)))
     predicted = [k for k, rows in enumerate(shared) if len(rows)]
     if len(samples) < 2 or not predicted:
         return None, Decision(False), STIFFNESSES[0]
     clusters = [np.unique(samples[k].cluster[shared[k]], return_inverse=True)[1] for k in predicted]
-    others = {k: [sample for number, sample in enumerate(samples) if number != k] for k in predicted}
-    flat = Losses([samples[k].losses(flat_colour(others[k]), shared[k]) for k in predicted], clusters)
+    others = [[sample for number, sample in enumerate(samples) if number % folds != fold] for fold in range(folds)]
+    colours = [flat_colour(other) for other in others]
+    flat = Losses([samples[k].losses(colours[k % folds], shared[k]) for k in predicted], clusters)
     best: tuple[Decision, float] | None = None
+    textures = [np.tile(colour, (laplacian.shape[0], 1)) for colour in colours]
     for stiffness in STIFFNESSES:
-        textures = [samples[k].operator @ solve_texture(others[k], laplacian, stiffness) for k in predicted]
-        losses = [samples[k].losses(t, shared[k]) for k, t in zip(predicted, textures, strict=True)]
+        pairs = zip(others, textures, strict=True)
+        textures = [solve_texture(other, laplacian, stiffness, texture) for other, texture in pairs]
+        losses = [samples[k].losses(samples[k].operator @ textures[k % folds], shared[k]) for k in predicted]
         evidence = compare_models(flat, Losses(losses, clusters), CLEARLY_FOR)
         if best is not None and (evidence.held_out_loss_with or 0) >= (best[0].held_out_loss_with or 0):
             break
