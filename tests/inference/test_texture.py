@@ -74,3 +74,20 @@ def test_what_no_photo_shows_continues_what_is_around():
     seen = sum(one.operator.T @ one.weight for one in samples) > 0
     assert not seen.all()
     np.testing.assert_allclose(factor[~seen], np.tile([0.5, 1.5, 1.0], ((~seen).sum(), 1)), rtol=0.05)
+
+
+def test_photos_of_opposite_sides_are_no_evidence_for_each_other():
+    sides = []
+    for sign in (1, -1):
+        one = pixels(PAINT, 0)
+        rows = np.flatnonzero(sign * (one.operator @ PLACE[:, 0]) > 0.3)
+        sides.append(TextureSamples(one.operator[rows], one.ratio[rows], one.weight[rows], one.cluster[rows]))
+    factor, evidence, _ = select_texture(sides, LAPLACIAN)
+    assert factor is None and evidence.held_out_loss_with is None
+
+
+def test_grazing_and_dark_pixels_count_less():
+    diffuse = np.array([0.4, 0.4, 0.04])[:, None] * np.ones(3)
+    operator = csr_array(np.eye(3))
+    weight = observe_texture(diffuse, diffuse, 0 * diffuse, np.array([1.0, 0.1, 1.0]), (operator, np.arange(3))).weight
+    assert weight[1] == pytest.approx(0.1 * weight[0]) and weight[2] < 0.6 * weight[0]
