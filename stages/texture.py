@@ -27,7 +27,7 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
 from factorlib.reflection import reflection_operator
-from factorlib.render.resynthesis import Reflector, read_surroundings, resynthesise
+from factorlib.render.resynthesis import Reflector, read_surroundings, resynthesise_parts
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import MaterialTable, read_materials, select_materials
 from factorlib.results.surface_table import DetailEvidence, read_surface
@@ -69,21 +69,26 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     fitted = sorted(solved_photos(lights))
     total = len(fitted) + len(meshes) + len(photos)
     observed: dict[tuple[str, str], list[TextureSamples]] = {}
-    for name in fitted:
+
+    def observe(name: str) -> list[tuple[tuple[str, str], TextureSamples]]:
+        """Return what a photo observes."""
+        samples = list(observe_photo(inputs, name, lights[name], (photos[name], fine), table))
         progress(next(steps), total, f"{name}: light and highlights")
-        for key, pixels in observe_photo(inputs, name, lights[name], (photos[name], fine), table):
-            observed.setdefault(key, []).append(pixels)
+        return samples
+
+    for pixels in inputs.map(observe, fitted):
+        for key, samples in pixels:
+            observed.setdefault(key, []).append(samples)
     factors: Factors = {}
     evidence = []
     for name, mesh in fine.items():
         progress(next(steps), total, f"texture of {name}")
-        for key, samples in sorted(observed.items()):
-            if key[0] == name:
-                values, decision, stiffness = select_texture(samples, mesh.laplacian())
-                by = DetailEvidence.from_decision(decision, stiffness)
-                evidence.append(TextureEvidence(*key, values is not None, len(samples), by))
-                if values is not None:
-                    factors[key] = values.astype(np.float32)
+        for key in sorted(key for key in observed if key[0] == name):
+            values, decision, stiffness = select_texture(observed[key], mesh.laplacian())
+            by = DetailEvidence.from_decision(decision, stiffness)
+            evidence.append(TextureEvidence(*key, values is not None, len(observed[key]), by))
+            if values is not None:
+                factors[key] = values.astype(np.float32)
     longest = {name: longest_edge(name, meshes[name], photos, params.edge) for name, _ in factors}
     write_json(out / FILE, TextureTable(longest, evidence))
     if factors:
@@ -133,12 +138,9 @@ def observe_photo(
     )
     around = read_surroundings(inputs.folders, name, table.model)
     bare = {channel: values for channel, values in geometry.items() if channel not in DETAIL}
-    black = (0.0, 0.0, 0.0)
-    parts = [
-        [msgspec.structs.replace(material, **{part: black}) for material in materials]
-        for part in ("specular", "diffuse")
-    ]
-    diffuse, specular = (resynthesise(reflector, part, photo, bare, surroundings=around)[y, x] for part in parts)
+    diffuse, specular = (
+        part[y, x] for part in resynthesise_parts(reflector, materials, photo, bare, surroundings=around)
+    )
     cosine = sum(geometry[f"normal.{a}"][y, x] * geometry[f"view.{a}"][y, x] for a in "xyz").clip(0, 1)
     label = np.rint(photo["label"][y, x]).astype(int)
     cluster = (y // CLUSTER_PIXELS) * geometry["depth"].shape[1] + x // CLUSTER_PIXELS

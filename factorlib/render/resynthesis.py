@@ -78,7 +78,19 @@ class Reflector:
         report: Report = silently,
         effects: PointEffects = PointEffects(),
     ) -> Float[np.ndarray, "n 3"]:
-        """Return the radiance that points reflect toward the viewer; float64, zero where a normal faces away.
+        """Return the radiance that points reflect toward the viewer, the sum of `parts`."""
+        diffuse, specular = self.parts(material, normals, views, report, effects)
+        return diffuse + specular
+
+    def parts(
+        self,
+        material: Reflectance,
+        normals: Float[np.ndarray, "n 3"],
+        views: Float[np.ndarray, "n 3"],
+        report: Report = silently,
+        effects: PointEffects = PointEffects(),
+    ) -> Float[np.ndarray, "2 n 3"]:
+        """Return the diffuse and the specular radiance of points; float64, zero where a normal faces away.
 
         Args:
             material: diffuse and specular reflectance, and roughness
@@ -87,7 +99,7 @@ class Reflector:
             report: receives the number of points done and their total
             effects: visibility, position and detail of the points
         """
-        result = np.zeros((len(normals), 3))
+        result = np.zeros((2, len(normals), 3))
         step = max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
         optional = msgspec.structs.astuple(effects)
         with torch.no_grad():
@@ -95,7 +107,7 @@ class Reflector:
                 rows = slice(i, i + step)
                 tensors = (None if values is None else self._tensor(values[rows]) for values in optional)
                 radiance = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), *tensors)
-                result[rows] = radiance.double().numpy()
+                result[:, rows] = radiance.double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
 
@@ -110,7 +122,7 @@ class Reflector:
         visibility: Float[Tensor, "n k"] | None,
         place: Float[Tensor, "n 3"] | None,
         detail: Float[Tensor, "n 3"] | None,
-    ) -> Float[Tensor, "n 3"]:
+    ) -> Float[Tensor, "2 n 3"]:
         parts = material.diffuse, material.specular, material.roughness
         kd, ks, roughness = (torch.tensor(part, dtype=self.operator.dtype) for part in parts)
         # cosines n·o per point, n·z and o·z per point and lobe; shares of each lobe that a point receives
@@ -128,14 +140,15 @@ class Reflector:
         if place is not None and self.curvature > 0:
             nz, oz, larger = finite_distance_cosines(place, normals, views, self.axis, self.curvature)
             shares = [larger * share for share in shares]
-        # diffuse part plus specular part, summed over lobes
-        radiance = kd * ((shares[0] * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
+        # diffuse and specular part, summed over lobes
+        diffuse = kd * ((shares[0] * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
         if detail is not None:
-            radiance = radiance * detail
+            diffuse = diffuse * detail
+        specular = torch.zeros_like(diffuse)
         if bool(ks.any()):
-            specular = self.operator.specular(roughness, self.sharpness, no, nz, oz)
-            radiance = radiance + ks * ((shares[1] * specular) @ self.weight)
-        return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
+            responses = self.operator.specular(roughness, self.sharpness, no, nz, oz)
+            specular = ks * ((shares[1] * responses) @ self.weight)
+        return torch.stack([diffuse, specular]) * (no[:, None] > 0)
 
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
@@ -188,7 +201,20 @@ def resynthesise(
     report: Report = silently,
     surroundings: Surroundings | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return the photo's linear radiance; zero outside the mask and where no mesh lies under it.
+    """Return the photo's linear radiance, the sum of `resynthesise_parts`."""
+    diffuse, specular = resynthesise_parts(reflector, materials, photo, geometry, report, surroundings)
+    return diffuse + specular
+
+
+def resynthesise_parts(
+    reflector: Reflector,
+    materials: Sequence[Reflectance],
+    photo: Channels,
+    geometry: Channels,
+    report: Report = silently,
+    surroundings: Surroundings | None = None,
+) -> Float[np.ndarray, "2 h w 3"]:
+    """Return the photo's diffuse and specular radiance; zero outside the mask and where no mesh lies under it.
 
     Args:
         reflector: the light
@@ -201,7 +227,7 @@ def resynthesise(
     label = np.rint(photo["label"]).astype(int)
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     label[~(np.abs(normal).max(axis=-1) > 0)] = 0
-    picture = np.zeros((*label.shape, 3))
+    pictures = np.zeros((2, *label.shape, 3))
     total = int((label > 0).sum())
     before = 0
 
@@ -216,16 +242,15 @@ def resynthesise(
         if "detail.R" in geometry:
             detail = np.stack([geometry[f"detail.{channel}"][pixels] for channel in "RGB"], axis=-1).astype(float)
         visibility, bounced, place = nearest_surroundings(surroundings, k - 1, *np.nonzero(pixels))
-        radiance = reflector(material, normals, views, report_pixels, PointEffects(visibility, place, detail))
+        radiance = reflector.parts(material, normals, views, report_pixels, PointEffects(visibility, place, detail))
         # radiance of bounces: k_d G_d + k_s G_s
         if bounced is not None:
-            diffuse = bounced[:, :3]
-            specular = bounced[:, 3:]
-            bounced = np.array(material.diffuse) * detail * diffuse + np.array(material.specular) * specular
-            radiance += bounced * (np.sum(normals * views, 1, keepdims=True) > 0)
-        picture[pixels] = radiance
+            facing = np.sum(normals * views, 1, keepdims=True) > 0
+            radiance[0] += np.array(material.diffuse) * detail * bounced[:, :3] * facing
+            radiance[1] += np.array(material.specular) * bounced[:, 3:] * facing
+        pictures[:, pixels] = radiance
         before += int(pixels.sum())
-    return picture
+    return pictures
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
