@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from factorlib.dataset import schema
-from factorlib.dataset.read_dataset import read_dataset
+from factorlib.dataset.read_dataset import hold_out, read_dataset
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.validation import Validation
 from tests.refusal import refusal
@@ -254,6 +254,16 @@ def test_a_set_with_every_photo_held_out_is_refused(folder):
     for photo in spec["photos"]:
         photo["held_out"] = True
     assert refusal("none is left to solve from", read_dataset, write(folder, spec)).key == "photos"
+
+
+def test_photos_held_out_for_one_run_must_exist_and_leave_one_to_solve_from(folder):
+    dataset = read_dataset(write(folder))
+    some = hold_out(dataset, ["hall, garden"])
+    assert [photo.name for photo in some.spec.photos if photo.held_out] == ["garden", "hall"]
+    assert hold_out(some, []) == some and hold_out(dataset, ["hall", "garden"]) == some
+    for names, words in (["attic"], "no photo 'attic'"), (["kitchen"], "none is left to solve from"):
+        error = refusal(words, hold_out, some, names)
+        assert error.key == "HELD_OUT" and "kitchen, garden, hall" in error.cure
 
 
 def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(folder):
