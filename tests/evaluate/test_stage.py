@@ -67,6 +67,9 @@ def test_a_held_out_photo_is_scored_apart(tmp_path, linked):
         == linked["resynthesis"]["photos"]["dusk"]["gauges"]["none"]
     )
     assert set(msgspec.convert(result, Metrics).photos) == {"day", "noon", "dusk"}
+    (view,) = result["views"].values()  # of one red ball, which "day" shows from the same side in another light
+    assert linked["views"] is None and view["visible"] > 0.5 and view["flat"] == pytest.approx(view["mean_colour"])
+    assert view["predicted"] > max(view["flat"], view["nearest_photo"])
 
 
 def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
