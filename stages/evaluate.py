@@ -34,7 +34,7 @@ from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, ver
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
-from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict, ViewScores
+from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
@@ -112,18 +112,17 @@ def _read_photo(inputs: Inputs, name: str) -> ComparedPhoto:
     return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
 
-def _views(inputs: Inputs, held_out: list[str], solved: list[str]) -> dict[str, ViewScores] | None:
+def _views(inputs: Inputs, held_out: list[str], solved: list[str]) -> dict[str, dict[str, float]] | None:
     """Return the scores of predicted views, by held-out photo; None without any."""
     poses = read_poses(inputs["align"] / "poses.json")
 
     def read(name: str) -> PosedPhoto:
-        """Return a photo with its poses and the maps of `align`."""
-        return PosedPhoto(_read_photo(inputs, name), poses[name], read_exr(inputs["align"] / f"{name}.exr"))
+        """Return a photo with its camera, poses and the maps of `align`."""
+        photo = _read_photo(inputs, name)
+        camera = poses[name].camera.camera(*photo.label.shape[::-1])
+        return PosedPhoto(photo, read_geometry(inputs["align"], None, name), camera, poses[name].objects)
 
-    views = {}
-    for name in held_out:
-        sources = [each for each in solved if poses[each].objects.keys() & poses[name].objects.keys()]
-        views[name] = compare_view(read(name), map(read, sources))
+    views = {name: compare_view(read(name), map(read, solved)) for name in held_out}
     return {name: scores for name, scores in views.items() if scores} or None
 
 

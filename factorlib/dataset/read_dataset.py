@@ -75,12 +75,11 @@ def hold_out(dataset: Dataset, names: Sequence[str]) -> Dataset:
     chosen = " ".join(names).replace(",", " ").split()
     photos = [msgspec.structs.replace(p, held_out=p.held_out or p.name in chosen) for p in dataset.spec.photos]
     known = [photo.name for photo in photos]
-    for name in (name for name in chosen if name not in known):
-        cure = f"name photos of the dataset, separated by commas; they are {_enumerate(known)}"
-        raise InputError(f"there is no photo {name!r}", key="HELD_OUT", cure=cure)
-    if all(photo.held_out for photo in photos):
-        cure = f"leave out at least one of the dataset's photos, which are {_enumerate(known)}"
-        raise InputError("every photo is held out, so that none is left to solve from", key="HELD_OUT", cure=cure)
+    faults = [f"there is no photo {name!r}" for name in chosen if name not in known]
+    if faults or all(photo.held_out for photo in photos):
+        fault = faults[0] if faults else "every photo is held out, so that none is left to solve from"
+        cure = f"name some of the dataset's photos, but not all, separated by commas; they are {_enumerate(known)}"
+        raise InputError(fault, key="HELD_OUT", cure=cure)
     return msgspec.structs.replace(dataset, spec=msgspec.structs.replace(dataset.spec, photos=photos))
 
 
@@ -110,7 +109,10 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
         hint = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
         faults.append(
             InputError(
-                f"{fault}: {_enumerate(places)}", file=file, key=places[0], cure=f"write what belongs there, in place of `?`{hint}"
+                f"{fault}: {_enumerate(places)}",
+                file=file,
+                key=places[0],
+                cure=f"write what belongs there, in place of `?`{hint}",
             )
         )
     try:

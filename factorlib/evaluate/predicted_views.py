@@ -23,49 +23,54 @@ from scipy.ndimage import map_coordinates
 
 from factorlib.evaluate.picture_errors import Channels, ComparedPhoto, flat_colours
 from factorlib.evaluate.relighting import displayed_psnr
-from factorlib.results.metrics import ViewScores
-from factorlib.results.poses import ObjectPose, PhotoPoses
+from factorlib.geometry.camera import Camera
+from factorlib.results.poses import ObjectPose
 
 DEPTH_TOLERANCE = 0.01  # of the extent of an object's visible points
 
 
 class PosedPhoto(msgspec.Struct, frozen=True):
-    """A photo with its re-synthesis, its poses, and the channels of `align`."""
+    """A photo with its re-synthesis, the channels of `align`, its camera, and the poses of its objects by name."""
 
     compared: ComparedPhoto
-    poses: PhotoPoses
     geometry: Channels
+    camera: Camera
+    objects: dict[str, ObjectPose]
 
 
-def compare_view(photo: PosedPhoto, sources: Iterable[PosedPhoto]) -> ViewScores | None:
-    """Score the predicted view of a held-out photo beside flat colours and other photos; None if no pixel counts.
+def compare_view(photo: PosedPhoto, sources: Iterable[PosedPhoto]) -> dict[str, float]:
+    """Score the predicted view of a held-out photo, flat colours, and other photos in its place.
 
     Args:
         photo: the held-out photo
         sources: the solved photos
+
+    Returns:
+        PSNR in dB by picture, and `visible`, the fraction of the pixels whose points a solved photo sees; empty if no
+        pixel counts.
     """
     pixels = photo.compared.pixels
     if not pixels.any():
-        return None
+        return {}
     truth = photo.compared.photo[pixels]
     flat = flat_colours(photo.compared)[pixels]
     warped, visible = warp_photos(photo, sources)
-    # least squares: s = Σ w·t / Σ w·w over visible points
-    scale = np.sum(warped[visible] * truth[visible]) / max(np.sum(warped[visible] ** 2), 1e-300)
+    # least squares over visible points: exposure = Σ w·t / Σ w·w
+    exposure = np.sum(warped[visible] * truth[visible]) / max(np.sum(warped[visible] ** 2), 1e-300)
     views = {
         "predicted": np.nan_to_num(photo.compared.resynthesis[pixels], posinf=0.0, neginf=0.0),
         "mean_colour": np.broadcast_to(truth.mean(axis=0), truth.shape),
         "flat": flat,
-        "nearest_photo": np.where(visible[:, None], scale * warped, flat),
+        "nearest_photo": np.where(visible[:, None], exposure * warped, flat),
     }
     scores = {name: displayed_psnr(view, truth) for name, view in views.items()}
-    return ViewScores(**scores, visible=round(float(visible.mean()), 6))
+    return scores | {"visible": round(float(visible.mean()), 6)}
 
 
 def warp_photos(
     photo: PosedPhoto, sources: Iterable[PosedPhoto]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Return, for each counted pixel of a photo, the radiance in the source that sees its point from the nearest direction.
+    """Return, for each counted pixel of a photo, the radiance in the source that sees its point from the nearest side.
 
     Args:
         photo: the photo
@@ -74,26 +79,21 @@ def warp_photos(
     Returns:
         The radiance, 0 where no source sees the point, and a mask of the points that a source sees.
     """
-    rows, columns = np.nonzero(photo.compared.pixels)
-    height, width = photo.compared.label.shape
-    rays = photo.poses.camera.camera(width, height).rays()[rows, columns]
-    points = rays * photo.geometry["depth"][rows, columns, None]
-    normals = np.stack([photo.geometry[f"normal.{axis}"][rows, columns] for axis in "xyz"], axis=-1)
-    label = photo.compared.label[rows, columns]
-    number = np.rint(photo.geometry["object"][rows, columns])
+    pixels = photo.compared.pixels
+    label = photo.compared.label[pixels]
+    points = photo.camera.rays()[pixels] * photo.geometry["depth"][pixels][:, None]
+    normals = np.stack([photo.geometry[f"normal.{axis}"][pixels] for axis in "xyz"], axis=-1)
     radiance = np.zeros((len(points), 3))
     nearest = np.full(len(points), -np.inf)  # cosine between the directions to both cameras
     for source in sources:
-        for k, (name, pose) in enumerate(photo.poses.objects.items(), start=1):
-            chosen = np.flatnonzero(number == k)
-            source_pose = source.poses.objects.get(name)
-            if source_pose is None or source_pose.left_out or not len(chosen):
-                continue
-            surface = points[chosen], normals[chosen], label[chosen]
-            colour, cosine = project_points(*surface, pose, source, source_pose)
-            better = cosine > nearest[chosen]
-            radiance[chosen[better]] = colour[better]
-            nearest[chosen[better]] = cosine[better]
+        for number, (name, pose) in enumerate(photo.objects.items(), start=1):
+            rows = np.flatnonzero(np.rint(photo.geometry["object"][pixels]) == number)
+            if name in source.objects and not source.objects[name].left_out and len(rows):
+                surface = points[rows], normals[rows], label[rows]
+                colour, cosine = project_points(*surface, pose, source, source.objects[name])
+                nearer = cosine > nearest[rows]
+                radiance[rows[nearer]] = colour[nearer]
+                nearest[rows[nearer]] = cosine[nearer]
     return radiance, nearest > -np.inf
 
 
@@ -119,26 +119,23 @@ def project_points(
         Interpolated radiance, and the cosine between the directions to both cameras: −inf for points that the photo
         does not see.
     """
-    # x = (Rᵀ (x_cam − t)) / s: points and both cameras in the object's frame
+    # x = Rᵀ (x_cam − t) / s: points, and directions to both cameras, in the object's frame
     on_object = (points - pose.pose.translation) @ pose.pose.rotation / np.array(pose.scale)
-    to_camera, to_source = (
-        -each.pose.translation @ each.pose.rotation / np.array(each.scale) - on_object for each in (pose, source_pose)
-    )
-    norms = np.linalg.norm(to_camera, axis=1) * np.linalg.norm(to_source, axis=1)
-    cosine = np.sum(to_camera * to_source, axis=1) / np.maximum(norms, 1e-300)
-    projected = source_pose.pose.apply(on_object * np.array(source_pose.scale))
-    z = projected[:, 2]
-    height, width = source.compared.label.shape
-    camera = source.poses.camera.camera(width, height)
-    place = camera.project(np.where(z[:, None] > 0, projected, 1.0)).T[::-1] - 0.5  # rows and columns
+    directions = [-p.pose.translation @ p.pose.rotation / np.array(p.scale) - on_object for p in (pose, source_pose)]
+    lengths = np.prod([np.linalg.norm(direction, axis=1) for direction in directions], axis=0)
+    cosine = np.sum(directions[0] * directions[1], axis=1) / np.maximum(lengths, 1e-300)
+    visible = np.sum(normals @ pose.pose.rotation * np.array(pose.scale) * directions[1], axis=1) > 0
+    # in the source: pixels (row, column), between whose centres maps are interpolated
+    x, y, z = source_pose.pose.apply(on_object * np.array(source_pose.scale)).T
+    visible &= z > 0
+    place = source.camera.project(np.column_stack([x, y, np.where(visible, z, 1.0)])).T[::-1] - 0.5
 
     def sample(values: np.ndarray, order: int = 1) -> np.ndarray:
         """Interpolate a map of the source at the points."""
         return map_coordinates(values.astype(float), place, order=order, mode="constant", cval=-1.0)
 
-    tolerance = DEPTH_TOLERANCE * np.linalg.norm(np.ptp(projected, axis=0))
-    facing = np.sum(normals @ pose.pose.rotation * np.array(pose.scale) * to_source, axis=1) > 0
-    visible = facing & (z > 0) & (np.abs(sample(source.geometry["depth"]) - z) <= tolerance)
+    tolerance = DEPTH_TOLERANCE * np.linalg.norm(np.ptp(on_object * np.array(source_pose.scale), axis=0))
+    visible &= np.abs(sample(source.geometry["depth"]) - z) <= tolerance
     visible &= (sample(source.compared.pixels) > 1 - 1e-6) & (sample(source.compared.label, order=0) == label)
     colour = np.stack([sample(source.compared.photo[..., channel]) for channel in range(3)], axis=-1)
     return colour, np.where(visible, cosine, -np.inf)

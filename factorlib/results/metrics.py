@@ -6,7 +6,8 @@ section.
 set          counts of photos, materials, illuminations and connected components of the observation matrix
 resynthesis  always present: `factorlib.evaluate.picture_errors`
 held_out     predictions of held-out photos, likewise; null without any
-views        photo -> `ViewScores` of held-out photos; see `factorlib.evaluate.predicted_views`
+views        held-out photo -> picture -> PSNR: of the predicted view, and of pictures that need no materials; null
+             without any (`factorlib.evaluate.predicted_views`)
 materials    `factorlib.evaluate.truth`
 relighting   `factorlib.evaluate.relighting`
 relit_set    the relit set score of `factorlib.evaluate.relighting`
@@ -269,24 +270,6 @@ class PoseError(msgspec.Struct, frozen=True):
     null_rotation_deg: float
 
 
-class ViewScores(msgspec.Struct, frozen=True):
-    """PSNR of the predicted view of a held-out photo, and of pictures that need no materials, dB.
-
-    Attributes:
-        predicted: the re-synthesis
-        mean_colour: the photo's own mean colour
-        flat: each material in its own mean colour
-        nearest_photo: solved photos, warped through the meshes
-        visible: fraction of the pixels whose points a solved photo sees
-    """
-
-    predicted: float
-    mean_colour: float
-    flat: float
-    nearest_photo: float
-    visible: float
-
-
 Trust = Literal["good", "usable with care", "do not trust"]
 
 
@@ -323,7 +306,7 @@ class Metrics(msgspec.Struct, frozen=True):
     relit_set: RelitSet | None = None
     verdict: Verdict | None = None
     held_out: ResynthesisErrors | None = None
-    views: dict[str, ViewScores] | None = None
+    views: dict[str, dict[str, float]] | None = None
 
     @property
     def photos(self) -> dict[str, PhotoErrors]:
