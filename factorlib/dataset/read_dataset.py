@@ -75,11 +75,13 @@ def hold_out(dataset: Dataset, names: Sequence[str]) -> Dataset:
     chosen = " ".join(names).replace(",", " ").split()
     photos = [msgspec.structs.replace(p, held_out=p.held_out or p.name in chosen) for p in dataset.spec.photos]
     known = [photo.name for photo in photos]
-    faults = [f"there is no photo {name!r}" for name in chosen if name not in known]
-    if faults or all(photo.held_out for photo in photos):
-        fault = faults[0] if faults else "every photo is held out, so that none is left to solve from"
-        cure = f"name some of the dataset's photos, but not all, separated by commas; they are {_enumerate(known)}"
-        raise InputError(fault, key="HELD_OUT", cure=cure)
+    unknown = [f"there is no photo {name!r}" for name in chosen if name not in known]
+    if unknown or all(photo.held_out for photo in photos):
+        raise InputError(
+            unknown[0] if unknown else "every photo is held out, so that none is left to solve from",
+            key="HELD_OUT",
+            cure=f"name some of the dataset's photos, but not all, separated by commas; they are {_enumerate(known)}",
+        )
     return msgspec.structs.replace(dataset, spec=msgspec.structs.replace(dataset.spec, photos=photos))
 
 

@@ -119,23 +119,25 @@ def project_points(
         Interpolated radiance, and the cosine between the directions to both cameras: −inf for points that the photo
         does not see.
     """
-    # x = Rᵀ (x_cam − t) / s: points, and directions to both cameras, in the object's frame
+    # x = Rᵀ (x_cam − t) / s: points, and unit directions to both cameras, in the object's frame
     on_object = (points - pose.pose.translation) @ pose.pose.rotation / np.array(pose.scale)
-    directions = [-p.pose.translation @ p.pose.rotation / np.array(p.scale) - on_object for p in (pose, source_pose)]
-    lengths = np.prod([np.linalg.norm(direction, axis=1) for direction in directions], axis=0)
-    cosine = np.sum(directions[0] * directions[1], axis=1) / np.maximum(lengths, 1e-300)
-    visible = np.sum(normals @ pose.pose.rotation * np.array(pose.scale) * directions[1], axis=1) > 0
-    # in the source: pixels (row, column), between whose centres maps are interpolated
+    centres = (-each.pose.translation @ each.pose.rotation / np.array(each.scale) for each in (pose, source_pose))
+    to_camera, to_source = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (c - on_object for c in centres))
+    facing = np.sum(normals @ pose.pose.rotation * np.array(pose.scale) * to_source, axis=1) > 0
+    # rows and columns of the source, in units of its pixels
     x, y, z = source_pose.pose.apply(on_object * np.array(source_pose.scale)).T
-    visible &= z > 0
-    place = source.camera.project(np.column_stack([x, y, np.where(visible, z, 1.0)])).T[::-1] - 0.5
+    place = source.camera.project(np.column_stack([x, y, np.where(z > 0, z, 1.0)])).T[::-1] - 0.5
 
     def sample(values: np.ndarray, order: int = 1) -> np.ndarray:
         """Interpolate a map of the source at the points."""
         return map_coordinates(values.astype(float), place, order=order, mode="constant", cval=-1.0)
 
-    tolerance = DEPTH_TOLERANCE * np.linalg.norm(np.ptp(on_object * np.array(source_pose.scale), axis=0))
-    visible &= np.abs(sample(source.geometry["depth"]) - z) <= tolerance
-    visible &= (sample(source.compared.pixels) > 1 - 1e-6) & (sample(source.compared.label, order=0) == label)
+    visible = (
+        facing
+        & (z > 0)
+        & (np.abs(sample(source.geometry["depth"]) - z) <= DEPTH_TOLERANCE * np.linalg.norm(np.ptp([x, y, z], axis=1)))
+        & (sample(source.compared.pixels) > 1 - 1e-6)
+        & (sample(source.compared.label, order=0) == label)
+    )
     colour = np.stack([sample(source.compared.photo[..., channel]) for channel in range(3)], axis=-1)
-    return colour, np.where(visible, cosine, -np.inf)
+    return colour, np.where(visible, np.sum(to_camera * to_source, axis=1), -np.inf)

@@ -247,23 +247,19 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
     assert sorted(folder.parent.rglob("*")) == sorted([*before, folder / "dataset.yaml"]), "something was written"
 
 
-def test_a_set_with_every_photo_held_out_is_refused(folder):
+def test_photos_held_out_by_the_file_or_for_one_run_exist_and_leave_one_to_solve_from(folder):
     spec = copy.deepcopy(SPEC)
-    spec["photos"][0]["held_out"] = True
-    assert read_dataset(write(folder, spec)).spec.photos[0].held_out
-    for photo in spec["photos"]:
-        photo["held_out"] = True
-    assert refusal("none is left to solve from", read_dataset, write(folder, spec)).key == "photos"
-
-
-def test_photos_held_out_for_one_run_must_exist_and_leave_one_to_solve_from(folder):
-    dataset = read_dataset(write(folder))
-    some = hold_out(dataset, ["hall, garden"])
-    assert [photo.name for photo in some.spec.photos if photo.held_out] == ["garden", "hall"]
-    assert hold_out(some, []) == some and hold_out(dataset, ["hall", "garden"]) == some
+    spec["photos"][1]["held_out"] = True
+    dataset = read_dataset(write(folder, spec))
+    some = hold_out(dataset, ["hall,garden"])
+    assert [photo.held_out for photo in some.spec.photos] == [False, True, True]
+    assert hold_out(some, []) == some and hold_out(dataset, ["hall"]) == some
     for names, words in (["attic"], "no photo 'attic'"), (["kitchen"], "none is left to solve from"):
         error = refusal(words, hold_out, some, names)
         assert error.key == "HELD_OUT" and "kitchen, garden, hall" in error.cure
+    for photo in spec["photos"]:
+        photo["held_out"] = True
+    assert refusal("none is left to solve from", read_dataset, write(folder, spec)).key == "photos"
 
 
 def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(folder):

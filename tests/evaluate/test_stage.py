@@ -57,9 +57,7 @@ def test_every_part_is_scored_beside_its_null_in_finite_numbers(linked):
 
 
 def test_a_held_out_photo_is_scored_apart(tmp_path, linked):
-    inputs = make_artifacts(Made(tmp_path / "in", seen=LINKED))
-    inputs.facts["dataset.light"]["dusk"]["held_out"] = True
-    result = evaluated(inputs, tmp_path / "out")
+    result = metrics_of(tmp_path, seen=LINKED, held_out=("dusk",))
     assert set(result["resynthesis"]["photos"]) == {"day", "noon"} and linked["held_out"] is None
     assert set(result["held_out"]["photos"]) == {"dusk"}
     assert (

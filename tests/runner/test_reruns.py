@@ -137,7 +137,9 @@ def test_a_change_reruns_who_is_reached_by_it_and_what_is_below_and_nothing_else
             assert other_keys(real) == below(real, stages), name
 
 
-def test_a_photo_held_out_for_one_run_has_the_keys_of_one_that_the_dataset_holds_out_and_spares_what_it_cannot_reach(real):
+def test_a_photo_held_out_for_one_run_has_the_keys_of_one_that_the_dataset_holds_out_and_spares_what_it_cannot_reach(
+    real,
+):
     spec = yaml.safe_load((real.root / "data/synthetic/dataset.yaml").read_text())
     first, *others = [photo["name"] for photo in spec["photos"]]
     held_out = keys(real, held_out=[f"{first},"])
