@@ -11,7 +11,7 @@ MAKEFLAGS += --no-print-directory
 
 .PHONY: all plan why status graph logs params new label compare validate verify clean gc pack setup lock test test-long docs results study studies data help help-all $(STAGES)
 
-# each reads DATASET, SET and FORCE from the environment
+# each reads DATASET, SET, HELD_OUT and FORCE from the environment
 all plan why status graph logs params new label compare validate verify pack $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
@@ -35,7 +35,7 @@ lock: .venv/ready
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache && $(PY) -m ruff format --check --no-cache --quiet
 	@.venv/bin/lint-imports --no-cache && $(PY) -m mypy
-	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 env -u DATASET -u SET -u FORCE $(PY) -m pytest -n 2 -p no:cacheprovider
+	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 env -u DATASET -u SET -u HELD_OUT -u FORCE $(PY) -m pytest -n 2 -p no:cacheprovider
 
 test-long: .venv/ready
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
@@ -70,6 +70,7 @@ help-all:
 	@echo 'make all DATASET=eames               run the whole pipeline; DATASET is a name in data/ or a path to a folder'
 	@echo 'make <stage> DATASET=…               run one stage and the stages that it needs: $(STAGES)'
 	@echo '     SET="solve.cells=800 …"         with other parameters      FORCE=1   run again, even if up to date'
+	@echo '     HELD_OUT=0066,0069               photos that this run predicts and does not solve from (docs/runner.md)'
 	@echo '     STRICT=1                         exit code 3 (2 of make) where the verdict is "do not trust" (docs/verdict.md)'
 	@echo '     FACTORLIB_STORE=<folder>         share results with other checkouts (docs/runner.md)'
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'

@@ -88,6 +88,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--force": {"key": "FORCE", "action": "store_true", "help": "run again, or delete without asking"},
     "--strict": {"key": "STRICT", "action": "store_true", "help": 'return 3 if the verdict is "do not trust"'},
     "--recipe": {"key": "RECIPE", "action": "append", "help": "recipe: a path, a name in recipes/, or all"},
+    "--held-out": {
+        "key": "HELD_OUT",
+        "action": "append",
+        "metavar": "PHOTO,PHOTO",
+        "help": "photos that this run predicts and does not solve from",
+    },
     "--photo": {"key": "PHOTO", "help": "name of a photo or a recipe"},
     "--photos": {"key": "PHOTOS", "type": _path, "help": "folder of photos"},
     "--masks": {"key": "MASKS", "type": _path, "help": "folder of masks"},
@@ -120,7 +126,7 @@ def add_option(parser: argparse.ArgumentParser, name: str) -> None:
 def request(arguments: Namespace, stages: list[str] | None = None) -> Request:
     """Return the request that the options describe; without `stages` it is for all stages."""
     force = getattr(arguments, "force", False)
-    return Request(dataset_of(arguments), stages or None, arguments.set, force, arguments.recipe)
+    return Request(dataset_of(arguments), stages or None, arguments.set, force, arguments.recipe, arguments.held_out)
 
 
 def _stage(arguments: Namespace) -> int:
@@ -128,7 +134,7 @@ def _stage(arguments: Namespace) -> int:
     return verbs.make(project(), request(arguments, [arguments.name]))
 
 
-COMMON = "--dataset --set --force --recipe"
+COMMON = "--dataset --set --force --recipe --held-out"
 VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, function, help; in the order of `--help`
     "all": (f"{COMMON} --strict", lambda a: verbs.make(project(), request(a), a.strict),
             "Run all stages that are not up to date, and render the named recipes."),
@@ -138,11 +144,12 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
              "List the steps that would run; with a recipe and no stage, those of its pictures only."),
     "why": (f"stages {COMMON}", lambda a: verbs.show_plan(project(), request(a, a.stages), True),
             "List every reason why steps would run."),
-    "status": ("stages --dataset --set --recipe", lambda a: verbs.show_status(project(), request(a, a.stages)),
+    "status": ("stages --dataset --set --recipe --held-out",
+               lambda a: verbs.show_status(project(), request(a, a.stages)),
                "Print the progress of each stage, and the warnings of current results."),
     "graph": ("--mermaid --dataset", lambda a: verbs.show_graph(project(), a.mermaid),
               "Print the stages and their inputs, as text or as a Mermaid diagram."),
-    "logs": ("stages --dataset --set --recipe --photo",
+    "logs": ("stages --dataset --set --recipe --held-out --photo",
              lambda a: verbs.show_logs(project(), request(a, a.stages), a.photo),
              "Print time, memory and package versions of current results."),
     "params": ("stages", lambda a: verbs.show_params(project(), a.stages),
@@ -154,7 +161,8 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
               "Draw masks on a page in the browser, served on this machine alone until Ctrl-C."),
     "compare": ("first second", lambda a: verbs.compare(project(), a.first, a.second),
                 "Write a page that compares two results: parameters, numbers, materials, lights."),
-    "validate": ("--dataset --set --sheet", lambda a: verbs.validate(project(), dataset_of(a), a.set, a.sheet),
+    "validate": ("--dataset --set --held-out --sheet",
+                 lambda a: verbs.validate(project(), dataset_of(a), a.set, a.sheet, a.held_out),
                  "Check pipeline.yaml, settings and dataset without running anything."),
     "pack": ("--dataset --out --force", lambda a: verbs.pack(project(), dataset_of(a), a.out, a.force),
              "Pack a result into one zip file that does not need its dataset."),

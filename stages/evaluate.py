@@ -14,6 +14,7 @@ from factorlib.dataset.schema import LightSlice, TruthFile, solved_photos
 from factorlib.evaluate.ball import OctahedralLight, octahedral_light
 from factorlib.evaluate.comparison_gauge import material_components
 from factorlib.evaluate.picture_errors import ComparedPhoto, combine_photo, compare_photos
+from factorlib.evaluate.predicted_views import PosedPhoto, compare_view
 from factorlib.evaluate.relighting import (
     compare_lights,
     compare_relighting,
@@ -75,7 +76,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     # connected components of the graph of materials and lights
     observed = _observed_materials(resynthesis, lights)
     component = material_components({light: names for light, names in observed.items() if names})
-    sections = dict.fromkeys(MISSING)
+    sections = dict.fromkeys(MISSING) | {"views": _views(inputs, held_out, solved)}
     sections["held_out"] = compare_photos(held_out, materials, read_photo) if held_out else None
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
@@ -109,6 +110,20 @@ def _read_photo(inputs: Inputs, name: str) -> ComparedPhoto:
     photo = read_exr(inputs["masks"] / f"{name}.exr")
     geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name, inputs.folders.get("texture"))
     return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+
+
+def _views(inputs: Inputs, held_out: list[str], solved: list[str]) -> dict[str, dict[str, float]] | None:
+    """Return the scores of predicted views, by held-out photo; None without any."""
+    poses = read_poses(inputs["align"] / "poses.json")
+
+    def read(name: str) -> PosedPhoto:
+        """Return a photo with its camera, poses and the maps of `align`."""
+        photo = _read_photo(inputs, name)
+        camera = poses[name].camera.camera(*photo.label.shape[::-1])
+        return PosedPhoto(photo, read_geometry(inputs["align"], None, name), camera, poses[name].objects)
+
+    views = {name: compare_view(read(name), map(read, solved)) for name in held_out}
+    return {name: scores for name, scores in views.items() if scores} or None
 
 
 def _observed_materials(resynthesis: ResynthesisErrors, lights: dict[str, LightSlice]) -> dict[str, list[str]]:

@@ -8,8 +8,11 @@ import logging
 import mmap
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
+
+import msgspec
 
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.gltf_header import buffer_path, read_header
@@ -25,7 +28,7 @@ MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 log = logging.getLogger("factorlib.dataset")
 UNKNOWN = "?"
 OPEN = "left_open"  # placeholder for `?` in a draft
-MOST_NAMED = 20  # open places that an error lists
+MOST_NAMED = 20  # open places or photos that an error lists
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -59,6 +62,35 @@ def read_dataset(path: str | Path) -> Dataset:
     return Dataset(folder=folder, spec=spec, companions=companions, external=external, truth=_read_truth(spec, file))
 
 
+def hold_out(dataset: Dataset, names: Sequence[str]) -> Dataset:
+    """Return the dataset with further photos held out, as if dataset.yaml said `held_out: true` for each.
+
+    Args:
+        dataset: the dataset
+        names: names of photos; one text may hold several, separated by commas or blanks
+
+    Raises:
+        InputError: A photo does not exist, or every photo would be held out.
+    """
+    chosen = " ".join(names).replace(",", " ").split()
+    photos = [msgspec.structs.replace(p, held_out=p.held_out or p.name in chosen) for p in dataset.spec.photos]
+    known = [photo.name for photo in photos]
+    unknown = [f"there is no photo {name!r}" for name in chosen if name not in known]
+    if unknown or all(photo.held_out for photo in photos):
+        raise InputError(
+            unknown[0] if unknown else "every photo is held out, so that none is left to solve from",
+            key="HELD_OUT",
+            cure=f"name some of the dataset's photos, but not all, separated by commas; they are {_enumerate(known)}",
+        )
+    return msgspec.structs.replace(dataset, spec=msgspec.structs.replace(dataset.spec, photos=photos))
+
+
+def _enumerate(names: Sequence[str]) -> str:
+    """Format the first names and the number of further ones."""
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
 def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     """Read a dataset.yaml that may be unfinished, with a placeholder for each `?`, and all its faults.
 
@@ -75,12 +107,14 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     value = _fill_placeholders(value, "", places)
     faults = []
     if places:
-        listed = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
         fault = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
         hint = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
         faults.append(
             InputError(
-                f"{fault}: {listed}", file=file, key=places[0], cure=f"write what belongs there, in place of `?`{hint}"
+                f"{fault}: {_enumerate(places)}",
+                file=file,
+                key=places[0],
+                cure=f"write what belongs there, in place of `?`{hint}",
             )
         )
     try:

@@ -261,12 +261,18 @@ def compare_photos(
     return ResynthesisErrors(photos, mean, *worst)
 
 
+def flat_colours(photo: ComparedPhoto) -> Picture:
+    """Return a picture of each material in its own mean colour over the pixels that count, black elsewhere."""
+    flat = np.zeros_like(photo.photo)
+    for label in np.unique(photo.label[photo.pixels]):
+        region = photo.pixels & (photo.label == label)
+        flat[region] = photo.photo[region].mean(axis=0)
+    return flat
+
+
 def _photo_errors(photo: ComparedPhoto, materials: list[str], factor: dict[str, Float[np.ndarray, "3"]]) -> PhotoErrors:
     regions = {m: photo.pixels & (photo.label == k) for k, m in enumerate(materials, start=1)}
-    flat = np.zeros_like(photo.photo)  # the null
-    for region in (region for region in regions.values() if region.any()):
-        flat[region] = photo.photo[region].mean(axis=0)
-    null = _score_with_null(flat, photo, regions)
+    null = _score_with_null(flat_colours(photo), photo, regions)
     errors = {g: _score_with_null(photo.resynthesis * factor[g], photo, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:

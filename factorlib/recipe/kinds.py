@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from factorlib.dataset.schema import GivenMaterial, Share, Shares, Vec2, Vec3
+from factorlib.dataset.schema import GivenMaterial, Number, Share, Shares, Vec2, Vec3
 from factorlib.errors import InputError
 from factorlib.reading import read_text, reading
 
@@ -26,6 +26,7 @@ Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
+PoseRow = tuple[Number, Number, Number, Number]
 LIGHT_FILES = (".hdr", ".exr")
 BALL = "ball"
 MOST_REFLECTED = 0.999  # largest max diffuse + max specular: with more, light between surfaces does not decay
@@ -87,8 +88,21 @@ class ResynthesisRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="resynthesis
     """Recipe of a photo with its objects replaced by path-traced ones."""
 
 
+class ViewCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Camera of a view, by exactly one of photo and pose."""
+
+    photo: str | None = None
+    """Photo whose camera is used, with its focal length and size; an object that both photos show places it."""
+    pose: tuple[PoseRow, PoseRow, PoseRow] | None = None
+    """Matrix [R t] from the frame of the photo's first object to that of the camera: x_cam = R x_object + t, in
+    OpenCV's axes and the mesh's units.  Focal length and size are the photo's own."""
+
+
 class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
-    """Recipe of the objects from another view: the camera moves about their middle; the light stays."""
+    """Recipe of the objects from another view; the light stays.
+
+    The camera moves about their middle, unless `camera` places it.
+    """
 
     azimuth: Degrees = 30.0
     """Angle about the camera's upright axis, to the right in the photo."""
@@ -96,6 +110,8 @@ class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
     """Angle upward, relative to the photo's camera."""
     zoom: Factor = 1.0
     """Magnification of the objects in the picture."""
+    camera: ViewCamera | None = None
+    """Camera that replaces the moved one, and with it azimuth, elevation and zoom."""
 
 
 class TurntableRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="turntable"):

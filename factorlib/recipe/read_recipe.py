@@ -92,9 +92,11 @@ def _check_distinct(refuse: Refusal, key: str, names: list[str], kind: str) -> N
 
 
 def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal) -> None:
-    """Check the photos and the assumed sun of a recipe."""
+    """Check the photos, the camera and the assumed sun of a recipe."""
     _check_names(refuse, "photos", recipe.photos, photos, "photo")
     _check_distinct(refuse, "photos", recipe.photos, "photo")
+    if isinstance(recipe, kinds.ViewRecipe) and recipe.camera is not None:
+        _check_camera(recipe, recipe.camera, photos, refuse)
     if recipe.sun is None:
         return
     if isinstance(recipe, kinds.RelightRecipe):
@@ -107,6 +109,23 @@ def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal)
         )
     if not any(recipe.sun.direction):
         refuse("sun.direction", "the direction has no length", "give a vector other than [0, 0, 0]")
+
+
+def _check_camera(recipe: kinds.ViewRecipe, camera: kinds.ViewCamera, photos: list[str], refuse: Refusal) -> None:
+    refuse.refuse_if(
+        (camera.photo is None) == (camera.pose is None),
+        "camera",
+        "needs exactly one of photo and pose",
+        "write `camera: {photo: NAME}`, or `camera: {pose: [[r, r, r, t], [r, r, r, t], [r, r, r, t]]}`",
+    )
+    moved = [
+        name for name in ("azimuth", "elevation", "zoom") if getattr(recipe, name) != getattr(kinds.ViewRecipe(), name)
+    ]
+    refuse.refuse_if(moved, "camera", f"cannot be combined with {' and '.join(moved)}", "keep one of the two")
+    if camera.photo is not None:
+        refuse.check_known("camera.photo", camera.photo, photos, "photo")
+    if camera.pose is not None:
+        refuse.check_rotation("camera.pose", tuple(row[:3] for row in camera.pose))
 
 
 def _check_new_object(

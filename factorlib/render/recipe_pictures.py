@@ -95,6 +95,7 @@ def _report_photo(progress: Progress, done: int, total: int, photo: str, share: 
 
 
 Report = Callable[[float], None]
+View = Callable[..., Float[np.ndarray, "4 4"]]
 
 
 def write_resynthesis(
@@ -218,7 +219,7 @@ def render_view(
     results: SolvedSet,
     photo: str,
     scene: PhotoScene,
-    orbit: Orbit = Orbit(),
+    view: View = Orbit().world_from_camera,
 ) -> Float[np.ndarray, "h w 4"]:
     """Render the objects from another view, over the environment map or a transparent background.
 
@@ -231,17 +232,16 @@ def render_view(
         results: the solved data set
         photo: name of the photo
         scene: the photo's scene
-        orbit: the view
+        view: returns the pose of the camera for a scene and the unit axis of the azimuth
 
     Returns:
         Linear radiance times coverage, and coverage.
     """
     lit = recipe.background == "light"
     if recipe.floor is None:
-        return traced_photo(scene, recipe.samples, orbit.world_from_camera(scene), lit)
+        return traced_photo(scene, recipe.samples, view(scene), lit)
     plane = results.ground(photo, scene.objects[0]).plane
-    world_from_camera = orbit.world_from_camera(scene, plane.normal)
-    return on_floor(scene, plane, recipe.floor, recipe.samples, world_from_camera, lit)
+    return on_floor(scene, plane, recipe.floor, recipe.samples, view(scene, plane.normal), lit)
 
 
 def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -255,8 +255,13 @@ def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Pa
         report: receives the share that is done, in [0, 1]
     """
     report(0)
-    scene = resize_scene(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
-    traced = render_view(recipe, results, photo, scene, Orbit(recipe.azimuth, recipe.elevation, recipe.zoom))
+    scene = results.scene(photo, recipe.sun, recipe.denoise)
+    view: View = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
+    if recipe.camera is not None:
+        camera, pose = results.camera(photo, recipe.camera)
+        scene = msgspec.structs.replace(scene, camera=camera)
+        view = lambda *_: pose  # noqa: E731
+    traced = render_view(recipe, results, photo, resize_scene(scene, recipe.width), view)
     _write_transparent(out / photo, TracedPicture(traced, results.tone(photo)))
 
 
@@ -280,7 +285,7 @@ def write_animation(
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
         if isinstance(recipe, kinds.TurntableRecipe):
-            traced = render_view(recipe, results, photo, scene, Orbit(degrees))
+            traced = render_view(recipe, results, photo, scene, Orbit(degrees).world_from_camera)
         else:
             turned = msgspec.structs.replace(scene, light=rotate_light(scene.light, degrees))
             traced = traced_photo(turned, recipe.samples)

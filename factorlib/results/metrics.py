@@ -6,6 +6,8 @@ section.
 set          counts of photos, materials, illuminations and connected components of the observation matrix
 resynthesis  always present: `factorlib.evaluate.picture_errors`
 held_out     predictions of held-out photos, likewise; null without any
+views        held-out photo -> picture -> PSNR: of the predicted view, and of pictures that need no materials; null
+             without any (`factorlib.evaluate.predicted_views`)
 materials    `factorlib.evaluate.truth`
 relighting   `factorlib.evaluate.relighting`
 relit_set    the relit set score of `factorlib.evaluate.relighting`
@@ -304,6 +306,7 @@ class Metrics(msgspec.Struct, frozen=True):
     relit_set: RelitSet | None = None
     verdict: Verdict | None = None
     held_out: ResynthesisErrors | None = None
+    views: dict[str, dict[str, float]] | None = None
 
     @property
     def photos(self) -> dict[str, PhotoErrors]:

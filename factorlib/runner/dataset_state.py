@@ -38,6 +38,7 @@ class Request(NamedTuple):
     targets:  stages; None for all that are not optional
     settings: `stage.parameter=value`;  force: run the targets again, whatever the store holds
     recipes:  paths, names or `all`: stages over recipes make their pictures
+    held_out: names of photos to hold out, beside those that the dataset holds out
     """
 
     dataset: str
@@ -45,6 +46,7 @@ class Request(NamedTuple):
     settings: Sequence[str] = ()
     force: bool = False
     recipes: Sequence[str] = ()
+    held_out: Sequence[str] = ()
 
 
 @dataclass
@@ -154,7 +156,7 @@ def read_state(project: Project, request: Request, look: bool = False) -> Datase
         pipeline = with_settings(read_pipeline(project.pipeline_file, project.provider.slices), request.settings)
         targets, recipe_words = _targets(pipeline, request, look)
         pipeline.check(targets or [])
-        data = project.provider.read(project.dataset_folder(request.dataset))
+        data = project.provider.read(project.dataset_folder(request.dataset), request.held_out)
         present = pipeline.for_data(lambda name: data.slice(name, None).facts is None)
         for name in (name for name in targets or [] if name not in present.stages):
             when = pipeline.stages[name].when

@@ -63,11 +63,11 @@ class Provider(NamedTuple):
     """Reader of datasets for the runner.
 
     slices: names of the slices that a dataset has
-    read:   function of a dataset's folder
+    read:   function of a dataset's folder, and of names of further photos to hold out
     """
 
     slices: tuple[str, ...]
-    read: Callable[[Path], Data]
+    read: Callable[[Path, Sequence[str]], Data]
 
 
 def restore_sigterm() -> None:
@@ -78,12 +78,12 @@ def restore_sigterm() -> None:
 
 def photo_sets() -> Provider:
     """Return the reader of datasets with a dataset.yaml."""
-    from factorlib.dataset.read_dataset import read_dataset
+    from factorlib.dataset.read_dataset import hold_out, read_dataset
     from factorlib.dataset.slices import SLICES, dataset_slice
 
-    def read(path: Path) -> Data:
-        """Read the dataset of a folder."""
-        dataset = read_dataset(path)
+    def read(path: Path, held_out: Sequence[str] = ()) -> Data:
+        """Read the dataset of a folder and hold out further photos."""
+        dataset = hold_out(read_dataset(path), held_out)
         restore_sigterm()
 
         def recipe(file: Path) -> Recipe:

@@ -11,7 +11,7 @@ import sys
 import textwrap
 import time
 from collections import Counter
-from collections.abc import Sized
+from collections.abc import Sequence, Sized
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -215,14 +215,17 @@ def show_params(project: Project, stages: list[str] | None) -> int:
     return 0
 
 
-def validate(project: Project, dataset: str, settings: list[str], sheet: bool = False) -> int:
+def validate(
+    project: Project, dataset: str, settings: list[str], sheet: bool = False, held_out: Sequence[str] = ()
+) -> int:
     """Check pipeline.yaml, the settings, dataset.yaml and every file that it names (photos by their headers).
 
     sheet: first write build/<dataset>/sheet.png, each photo beside its labels and meshes
+    held_out: names of photos to hold out
     """
     if sheet:
         _draw_sheet(project, project.dataset_folder(dataset))
-    state = read_state(project, Request(dataset, settings=settings))
+    state = read_state(project, Request(dataset, settings=settings, held_out=held_out))
     parameters_code = _refuse(state, state.parameter_faults(state.plan()), "parameters")
     if code := parameters_code or _refuse(state, state.file_faults(state.records), "files"):
         return code

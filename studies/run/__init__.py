@@ -56,7 +56,7 @@ class Studies(Project, frozen=True):
 
 def studies(scale: Scale = FULL, root: Path = LIBRARY) -> Studies:
     """Return the project of the studies of a scale."""
-    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), "studies.steps", scale=scale)
+    return Studies(root, Provider(SLICES, lambda folder, _: data_of(folder, scale)), "studies.steps", scale=scale)
 
 
 def data_of(folder: Path, scale: Scale) -> Data:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from factorlib.dataset import schema
-from factorlib.dataset.read_dataset import read_dataset
+from factorlib.dataset.read_dataset import hold_out, read_dataset
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.validation import Validation
 from tests.refusal import refusal
@@ -247,10 +247,16 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
     assert sorted(folder.parent.rglob("*")) == sorted([*before, folder / "dataset.yaml"]), "something was written"
 
 
-def test_a_set_with_every_photo_held_out_is_refused(folder):
+def test_photos_held_out_by_the_file_or_for_one_run_exist_and_leave_one_to_solve_from(folder):
     spec = copy.deepcopy(SPEC)
-    spec["photos"][0]["held_out"] = True
-    assert read_dataset(write(folder, spec)).spec.photos[0].held_out
+    spec["photos"][1]["held_out"] = True
+    dataset = read_dataset(write(folder, spec))
+    some = hold_out(dataset, ["hall,garden"])
+    assert [photo.held_out for photo in some.spec.photos] == [False, True, True]
+    assert hold_out(some, []) == some and hold_out(dataset, ["hall"]) == some
+    for names, words in (["attic"], "no photo 'attic'"), (["kitchen"], "none is left to solve from"):
+        error = refusal(words, hold_out, some, names)
+        assert error.key == "HELD_OUT" and "kitchen, garden, hall" in error.cure
     for photo in spec["photos"]:
         photo["held_out"] = True
     assert refusal("none is left to solve from", read_dataset, write(folder, spec)).key == "photos"

@@ -52,6 +52,7 @@ class Made(msgspec.Struct):
     error: float = 1.0
     truth: bool = True
     clip: float = 2.0
+    held_out: tuple[str, ...] = ()
 
 
 def light_map(seed: int) -> np.ndarray:
@@ -94,7 +95,9 @@ def make_artifacts(made: Made) -> Inputs:
     facts = {
         "dataset.materials": materials,
         "dataset.objects": dict.fromkeys(made.seen, balls),
-        "dataset.light": {p: {"illumination": p, "world_from_camera": None} for p in made.seen},
+        "dataset.light": {
+            p: {"illumination": p, "world_from_camera": None, "held_out": p in made.held_out} for p in made.seen
+        },
         "dataset.set": {"name": "made", "materials": materials, "photos": list(made.seen), "meshes": meshes},
         "dataset.ground": {photo: {"ground": None} for photo in made.seen},
         "dataset.truth": {

@@ -57,9 +57,7 @@ def test_every_part_is_scored_beside_its_null_in_finite_numbers(linked):
 
 
 def test_a_held_out_photo_is_scored_apart(tmp_path, linked):
-    inputs = make_artifacts(Made(tmp_path / "in", seen=LINKED))
-    inputs.facts["dataset.light"]["dusk"]["held_out"] = True
-    result = evaluated(inputs, tmp_path / "out")
+    result = metrics_of(tmp_path, seen=LINKED, held_out=("dusk",))
     assert set(result["resynthesis"]["photos"]) == {"day", "noon"} and linked["held_out"] is None
     assert set(result["held_out"]["photos"]) == {"dusk"}
     assert (
@@ -67,6 +65,9 @@ def test_a_held_out_photo_is_scored_apart(tmp_path, linked):
         == linked["resynthesis"]["photos"]["dusk"]["gauges"]["none"]
     )
     assert set(msgspec.convert(result, Metrics).photos) == {"day", "noon", "dusk"}
+    (view,) = result["views"].values()  # of one red ball, which "day" shows from the same side in another light
+    assert linked["views"] is None and view["visible"] > 0.5 and view["flat"] == pytest.approx(view["mean_colour"])
+    assert view["predicted"] > max(view["flat"], view["nearest_photo"])
 
 
 def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):

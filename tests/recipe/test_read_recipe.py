@@ -69,6 +69,10 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: view\nphotos: [hall]\nsun: {direction: [0, 1, 0], strength: 60}", ["sun.strength", "<= 1"]),
     ("kind: view\nphotos: [hall]\nsun: {direction: [0, 1, 0]}", ["sun", "strength"]),
     ("kind: relight\nphotos: [hall]\nsun: {direction: [0, 1, 0], strength: 0.5}", ["sun", "remove `sun`"]),
+    ("kind: view\ncamera: {}", ["camera", "exactly one of photo and pose", "photo: NAME"]),
+    ("kind: view\ncamera: {photo: hal}", ["camera.photo", "did you mean 'hall'"]),
+    ("kind: view\nzoom: 2\ncamera: {photo: hall}", ["camera", "cannot be combined with zoom"]),
+    ("kind: view\ncamera: {pose: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 9]]}", ["camera.pose", "not a rotation"]),
     ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
 ])  # fmt: skip
 def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):

@@ -9,4 +9,4 @@ from tests.report.test_page import LINKED, run
 def report_page(tmp_path_factory):
     """Its folder, the inputs of `report`, and the page."""
     folder = tmp_path_factory.mktemp("page")
-    return folder, *run(folder, seen=LINKED)
+    return folder, *run(folder, seen=LINKED, held_out=("dusk",))

@@ -91,7 +91,8 @@ def parsed(html) -> Strict:
 def test_it_is_well_formed_has_every_section_and_asks_for_nothing_outside_the_file(report_page):
     result = parsed(report_page[2])
     tables = {
-        f"table-{key}" for key in ("resynthesis", "materials", "relighting", "unobserved", "light", "normals", "poses")
+        f"table-{key}"
+        for key in ("resynthesis", "materials", "relighting", "unobserved", "light", "normals", "poses", "views")
     }
     assert CONTENTS | tables <= set(result.ids) and len(set(result.ids)) == len(result.ids)
     files = [link for link in result.links if link.startswith("../")]  # followed, never asked for
@@ -121,6 +122,7 @@ def test_the_numbers_are_those_of_the_metrics_and_of_the_training_in_order(repor
     metrics = read_json(report_page[0] / "evaluate" / "metrics.json")
     assert f"{metrics['resynthesis']['mean']['none']['estimate']['psnr_tonemapped_db']:.1f}" in report_page[2]
     assert f"{metrics['materials']['mean_roughness']:.3f}" in report_page[2]
+    assert f"{metrics['views']['dusk']['nearest_photo']:.1f}" in report_page[2].split('id="table-views"')[1]
     section, bins = report_page[2].split('id="training"')[1].split('id="cost"')[0], ["0.3 to 3", "3 to 30", "30 to 300"]
     order = [section.index(f">{name}</th>") for name in ("specular", "sharpness", *bins, "diffuse")]
     assert order == sorted(order) and "0.20 %" in section

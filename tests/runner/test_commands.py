@@ -156,7 +156,7 @@ TRIES = [
     f'"; touch {PWNED}; "', f"'; touch {PWNED}; '", f"x; touch {PWNED}", f"x\ntouch {PWNED}",
     f"$(eval X:=$(shell touch {PWNED}))", f"x #\\\n| touch {PWNED}", f"$(info $(shell touch {PWNED}))",
 ]  # fmt: skip
-VARIABLES = ["DATASET", "SET", "FORCE", "DATASETS", "RECIPE", "PYTHON", "TORCH_INDEX", "EXTRAS", "OTHER"]
+VARIABLES = ["DATASET", "SET", "HELD_OUT", "FORCE", "DATASETS", "RECIPE", "PYTHON", "TORCH_INDEX", "EXTRAS", "OTHER"]
 OWN = ["PY", "STAGES", "GOAL"]  # the Makefile's own
 
 

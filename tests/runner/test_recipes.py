@@ -42,7 +42,7 @@ def project(tmp_path):
     write(made.root / "recipes" / "set" / "more.txt", "…")
     write(made.root / "recipes" / "other" / "not.yaml", '{"word": "not for this set"}')
 
-    def read(folder):
+    def read(folder, held_out=()):
         data = toy.read(folder)
 
         def faults(files):

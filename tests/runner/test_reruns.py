@@ -41,14 +41,14 @@ def real(tmp_path_factory):
     return real_project(tmp_path_factory.mktemp("project"), "pipeline.yaml", "stages", "factorlib", "data", "recipes")
 
 
-def planned(project, settings=()):
+def planned(project, settings=(), held_out=()):
     """Every step, those of optional stages and of all recipes too, as planned were everything made."""
-    state = read_state(project, Request("synthetic", STAGES, settings, recipes=["all"]))
+    state = read_state(project, Request("synthetic", STAGES, settings, recipes=["all"], held_out=held_out))
     return plan(state.spec, state.records, Listing(Everything(), {}))
 
 
-def keys(project, settings=()):
-    return {str(p.step): p.key for p in planned(project, settings)}
+def keys(project, settings=(), held_out=()):
+    return {str(p.step): p.key for p in planned(project, settings, held_out)}
 
 
 @cache
@@ -135,6 +135,20 @@ def test_a_change_reruns_who_is_reached_by_it_and_what_is_below_and_nothing_else
     for name, more, stages in random.Random(17).sample(cases, count if few else len(cases)):
         with edited(real, name, (LIBRARY / name).read_bytes() + more):
             assert other_keys(real) == below(real, stages), name
+
+
+def test_a_photo_held_out_for_one_run_has_the_keys_of_one_that_the_dataset_holds_out_and_spares_what_it_cannot_reach(
+    real,
+):
+    spec = yaml.safe_load((real.root / "data/synthetic/dataset.yaml").read_text())
+    first, *others = [photo["name"] for photo in spec["photos"]]
+    held_out = keys(real, held_out=[f"{first},"])
+    spared = {step for step in usual(real) if step.partition("/")[0] in ("masks", "shapes", "align", "train")}
+    spared |= {f"urm/{photo}" for photo in others}
+    assert {step for step, key in usual(real).items() if held_out[step] == key} == spared
+    spec["photos"][0]["held_out"] = True
+    with edited(real, "data/synthetic/dataset.yaml", yaml.safe_dump(spec).encode()):
+        assert keys(real) == held_out
 
 
 def test_an_edit_that_keeps_size_and_time_is_noticed(real):

@@ -91,7 +91,7 @@ class Slice(msgspec.Struct):
     fields: dict
 
 
-def read(folder: Path) -> Data:
+def read(folder: Path, held_out=()) -> Data:
     photos = sorted(path.stem for path in folder.glob("*.txt"))
 
     def slice_(name, photo):

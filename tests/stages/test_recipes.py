@@ -97,6 +97,29 @@ def test_the_photo_stays_where_no_object_is(inputs, tmp_path):
     assert np.array_equal(result[far], photo[far]) and not np.array_equal(result[~empty], photo[~empty])
 
 
+POSE_ROWS = np.column_stack([made_export.POSES["side"].rotation, made_export.POSES["side"].translation]).tolist()
+
+
+@pytest.mark.parametrize("camera, lens, pose", [
+    ({"photo": "front"}, "front", "front"),
+    ({"photo": "side"}, "side", "side"),
+    ({"pose": POSE_ROWS}, "front", "side"),
+])  # fmt: skip
+def test_the_camera_of_a_view_sees_the_unit_ball_where_that_photo_or_pose_has_it(inputs, tmp_path, camera, lens, pose):
+    facts = {"kind": "view", "photos": ["front"], "samples": 4, "camera": camera}
+    drawn(inputs, tmp_path / "out", kinds.recipe_of(facts))
+    rays = made_export.CAMERAS[lens].rays()
+    offsets = np.cross(rays, made_export.POSES[pose].translation) / np.linalg.norm(rays, axis=-1, keepdims=True)
+    covered = read_exr(tmp_path / "out" / "front.exr")["A"] > 0.5
+    assert ((np.linalg.norm(offsets, axis=-1) < 1) == covered).mean() > 0.98 and 0.1 < covered.mean() < 0.9
+
+
+def test_a_camera_of_a_photo_without_a_common_object_is_refused(inputs, tmp_path):
+    results = SolvedSet(inputs)
+    results.poses = {**results.poses, "side": msgspec.structs.replace(results.poses["side"], objects={})}
+    refusal("no object in common", results.camera, "front", kinds.ViewCamera(photo="side"))
+
+
 def own_material(inputs, tmp_path, material):
     write_json(tmp_path / "own.json", MaterialTable({"own": attach_errors(material, ERROR)}))
     recipe = kinds.TransferRecipe(photos=["front"], materials={"red": "own"}, table="own.json", samples=4)

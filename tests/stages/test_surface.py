@@ -18,8 +18,9 @@ from factorlib.results.materials import Reflectance
 from factorlib.results.surface_table import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent
 from factorlib.urm.extract import read_geometry, with_surface_normals
-from factorlib.urm.observations import Observations, write_observations
+from factorlib.urm.observations import Observations, read_observations, write_observations
 from stages import surface
+from tests.evaluate.made_artifacts import Made, make_artifacts
 from tests.inference.made import observations_from_front
 from tests.refusal import refusal
 
@@ -82,6 +83,19 @@ def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
     surface.main(surface.Params(shape="off"), Inputs({}), tmp_path, silent)
     assert read_surface(tmp_path) == SurfaceTable() == read_surface(None)
     assert [path.name for path in tmp_path.iterdir()] == ["surface.json"]
+
+
+def test_a_held_out_photo_takes_no_part_whatever_it_shows(tmp_path):
+    inputs = make_artifacts(Made(tmp_path, {"day": ["red"], "noon": ["red"], "dusk": ["red"]}, held_out=("dusk",)))
+    dusk = read_observations(inputs["urm"] / "dusk.parquet")
+    other = msgspec.structs.replace(dusk, radiance=3 * dusk.radiance[::-1], normal=dusk.normal[::-1])
+    results = []
+    for name, shown in {"one": dusk, "other": other}.items():
+        write_observations(inputs["urm"] / "dusk.parquet", shown)
+        (tmp_path / name).mkdir()
+        surface.main(surface.Params(), inputs, tmp_path / name, silent)
+        results.append([(tmp_path / name / file).read_bytes() for file in ("surface.json", "beginning.json")])
+    assert results[0] == results[1]
 
 
 def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
