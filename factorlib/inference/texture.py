@@ -35,7 +35,6 @@ from factorlib.results.materials import Decision
 
 STIFFNESSES = (3.0, 1.0, 0.3, 0.1, 0.03)  # a of (2), from stiff to soft
 PULL = 1e-4  # ε of (2), which only fixes meshes that no pixel shows
-FACING = 1.0
 DARK = 0.2  # d, as a share of a photo's mean diffuse radiance
 LOSS = RobustLoss(0.15)  # ρ of (2)
 REWEIGHTINGS = 2  # solutions of (2) after the first one
@@ -84,7 +83,7 @@ def observe_texture(
     """
     x = diffuse.mean(1)
     dark = DARK * max(float(x.mean()), 1e-12) if len(x) else 1.0
-    weight = cosine**FACING * x**2 / (x**2 + dark**2)
+    weight = cosine * x**2 / (x**2 + dark**2)
     ratio = (radiance - specular) / np.maximum(diffuse, 1e-3 * dark)
     return TextureSamples(positions[0], ratio.clip(0, LARGEST_RATIO), weight, positions[1])
 
