@@ -16,7 +16,7 @@ from factorlib.dataset.check import MESHES, instance_materials, mirror_balls
 from factorlib.dataset.schema import Dataset, MeshInstance, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.evaluate.comparison_gauge import material_components
-from factorlib.evaluate.truth import read_true_light, read_true_normals
+from factorlib.evaluate.truth import read_true_albedo, read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
@@ -109,7 +109,9 @@ class Validation:
             for name, path in self.dataset.truth.illumination.items():
                 yield f"light {path}", partial(read_true_light, self.file(path), name)
             for name, path in self.dataset.truth.normals.items():
-                yield f"normals {name}", partial(self._normals, name, self.file(path))
+                yield f"normals {name}", partial(self._true_map, "normals", name, self.file(path), read_true_normals)
+            for name, path in self.dataset.truth.albedo.items():
+                yield f"albedo {name}", partial(self._true_map, "albedo", name, self.file(path), read_true_albedo)
 
     def _ball(self, obj: MeshInstance, key: str) -> None:
         """Check that a mirror ball is round: its vertices are equally far from the centre of its bounding box."""
@@ -126,10 +128,12 @@ class Validation:
                 cure="name a ball, or use `primitive: ball`",
             )
 
-    def _normals(self, name: str, path: Path) -> None:
-        check_values(path, key=f"normals.{name}")
-        size = open_photo(self.file(self.dataset.photo(name).image), f"photos[{name}].image").size
-        read_true_normals(path, name, size[::-1])
+    def _true_map(
+        self, group: str, name: str, path: Path, read: Callable[[Path, str, tuple[int, int]], object]
+    ) -> None:
+        check_values(path, key=f"{group}.{name}")
+        height, width = open_photo(self.file(self.dataset.photo(name).image), f"photos[{name}].image").size
+        read(path, name, (width, height))
 
     def _photo(self, entry: PhotoEntry, most_megapixels: float) -> None:
         key = f"photos[{entry.name}]"

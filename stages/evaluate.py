@@ -23,10 +23,13 @@ from factorlib.evaluate.relighting import (
     sphere_row,
 )
 from factorlib.evaluate.truth import (
+    albedo_errors,
+    average_albedo,
     average_normals,
     compare_materials,
     normal_error,
     pose_error,
+    read_true_albedo,
     read_true_light,
     read_true_normals,
 )
@@ -34,7 +37,7 @@ from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, ver
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
-from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
+from factorlib.results.metrics import AlbedoErrors, Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
@@ -50,6 +53,7 @@ MISSING = {
     "light": "the truth names no illumination of this set",
     "normals": "the truth has no normals for these photos",
     "poses": "the truth has no poses of these objects",
+    "albedo": "the truth has no albedo of these photos",
 }
 
 
@@ -89,6 +93,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             "light": lambda: compare_lights(estimated_lights, true_lights, _mirrored_directions(inputs, lights)),
             "normals": lambda: _normals(inputs, truth, lights),
             "poses": lambda: _poses(inputs, truth),
+            "albedo": lambda: _albedo(inputs, truth, estimates),
         }
         for name, section in compute.items():
             progress(next(counter), total, name)
@@ -97,8 +102,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     sections["verdict"] = _verdict(inputs, observed)
     counts = Counts(len(lights), len(materials), len(observed), len(set(component.values())))
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
-    if not sections["verdict"]:
-        reasons["verdict"] = NO_MATERIAL
+    reasons |= {} if sections["verdict"] else {"verdict": NO_MATERIAL}
     write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     if sections["verdict"]:
         write_text(out / "verdict.txt", verdict_text(sections["verdict"]))
@@ -203,6 +207,30 @@ def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) ->
         normal, _, pixels = _geometry(inputs, name)
         errors[name] = normal_error(normal, average_normals(true, photos[name].factor), pixels)
     return {name: error for name, error in errors.items() if error} or None
+
+
+def _albedo(inputs: Inputs, truth: TruthFile, estimates: dict[str, Reflectance]) -> AlbedoErrors | None:
+    """Return the errors of albedo over the observed pixels; None without true albedo of them."""
+    names = list(inputs.facts["dataset.materials"])
+    diffuse = np.array([estimates[name].diffuse if name in estimates else (np.nan,) * 3 for name in names])
+    columns = []
+    for name, entry in read_photos(inputs["masks"] / "photos.json").items():
+        if name not in truth.albedo:
+            continue
+        true = read_true_albedo(inputs.file(truth.albedo[name]), name, entry.original_size)
+        true = average_albedo(true, entry.factor)
+        photo = read_exr(inputs["masks"] / f"{name}.exr")
+        geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name, inputs.folders.get("texture"))
+        detail = np.stack([geometry.get(f"detail.{c}", np.ones(true.shape[:2])) for c in "RGB"], axis=-1)
+        material = np.rint(photo["label"]).astype(int) - 1
+        pixels = observed_pixels(photo, geometry) & (detail > 0).any(axis=-1) & (true > 0).all(axis=-1)
+        pixels &= np.isfinite(diffuse[material, 0])
+        flat = diffuse[material[pixels]]
+        columns.append((flat * detail[pixels], flat, true[pixels], material[pixels]))
+    if not columns:
+        return None
+    *kinds, true, material = map(np.concatenate, zip(*columns))
+    return albedo_errors(kinds, true, material, names)
 
 
 def _poses(inputs: Inputs, truth: TruthFile) -> dict[str, dict[str, PoseError]] | None:

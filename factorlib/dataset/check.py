@@ -100,7 +100,8 @@ def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -
     lights = {photo.light for photo in spec.photos}
     for name in truth.materials:
         refuse.check_known(f"materials.{name}", name, spec.materials, "material")
-    for group, known, kind in (("illumination", lights, "illumination"), ("normals", photos, "photo")):
+    groups = {"illumination": (lights, "illumination"), "normals": (photos, "photo"), "albedo": (photos, "photo")}
+    for group, (known, kind) in groups.items():
         for name, path in getattr(truth, group).items():
             refuse.check_known(f"{group}.{name}", name, known, kind)
             refuse.check_path(f"{group}.{name}", path, MAPS, must_exist=False)

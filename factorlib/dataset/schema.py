@@ -270,11 +270,12 @@ class TruthFile(_Format, frozen=True):
     illumination: dict[str, str] = {}
     normals: dict[str, str] = {}
     poses: dict[str, dict[str, RigidTransform]] = {}
+    albedo: dict[str, str] = {}
 
     @property
     def maps(self) -> list[str]:
         """The maps that the file names, sorted."""
-        return sorted({*self.illumination.values(), *self.normals.values()})
+        return sorted({*self.illumination.values(), *self.normals.values(), *self.albedo.values()})
 
 
 class ExternalCamera(msgspec.Struct, frozen=True):

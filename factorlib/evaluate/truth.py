@@ -1,4 +1,4 @@
-"""Truth of a data set: its maps, read and checked, and errors of recovered materials, normals and poses.
+"""Truth of a data set: its maps, read and checked, and errors of recovered materials, albedo, normals and poses.
 
 Normals    Angle between estimated and true normal over the pixels where both are known; null: every normal faces the
            camera.
@@ -11,29 +11,35 @@ Colours    Diffuse and specular, relative to the truth, after one factor per cha
            component's materials of true over estimated diffuse + specular: a material's total reflectance is known
            best, and one bad material does not move a median.  A true albedo below 0.01 counts as 0.01.  The null is a
            grey ball: diffuse 0.5, specular 0.05, roughness 0.5 for every material, scaled by its own factor.
+Albedo     |estimate / truth − 1| of k_d times the factor of the texture, per pixel and channel, over the pixels where
+           both are known, after one factor per channel for the set.  The factor is the median over these pixels of
+           truth over estimate.  The null is the flat material (factors of 1), scaled by its own factor.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from factorlib.conventions import FRONT
 from factorlib.dataset.schema import RigidTransform
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.photo import box_sum
+from factorlib.images.photo import box_mean, box_sum
 from factorlib.reading import reading
 from factorlib.results.materials import Reflectance, Vec3, vec3
 from factorlib.results.metrics import (
+    AlbedoErrors,
     AngleError,
     ComparedMaterial,
+    ErrorWithNull,
     MaterialError,
     MaterialScores,
     NormalError,
     PoseError,
+    RelativeError,
 )
 from factorlib.results.poses import PoseEntry
 
@@ -58,27 +64,64 @@ def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.
         InputError: The file lacks a channel, has another size, or holds an infinite value.
     """
     key = f"normals.{name}"
+    normals = _read_photo_map(path, key, size, vectors=True)
+    if np.isinf(normals).any():
+        raise InputError("a normal is infinite", file=path, key=key, cure="write 0 where the normal is unknown")
+    return normals
+
+
+def read_true_albedo(path: Path, name: str, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
+    """Read the true k_d of a photo's pixels, linear Rec. 709, from channels R, G, B.
+
+    Args:
+        path: the EXR file
+        name: name of the photo
+        size: width and height of the photo
+
+    Returns:
+        k_d, zero or NaN where unknown.
+
+    Raises:
+        InputError: The file lacks a channel, has another size, or holds a value below 0 or above 1.
+    """
+    key = f"albedo.{name}"
+    albedo = _read_photo_map(path, key, size)
+    if (wrong := albedo[(albedo < 0) | (albedo > 1)]).size:
+        raise InputError(
+            f"an albedo is {wrong[0]:.4g}",
+            file=path,
+            key=key,
+            cure="write the diffuse reflectance, from 0 to 1, and 0 where it is unknown",
+        )
+    return albedo
+
+
+def _read_photo_map(path: Path, key: str, size: tuple[int, int], vectors: bool = False) -> Float[np.ndarray, "h w 3"]:
+    """Read three channels of an EXR with the pixels of a photo of the given width and height.
+
+    They are R, G, B, or, if they may be `vectors`, normal.x/y/z.
+    """
     with reading("an image", path, key):
         channels = read_exr(path)
-    names = [f"normal.{axis}" for axis in "xyz"] if "normal.x" in channels else list("RGB")
+    axes = [f"normal.{axis}" for axis in "xyz"]
+    names = axes if vectors and "normal.x" in channels else list("RGB")
     if missing := [channel for channel in names if channel not in channels]:
+        forms = f"{', '.join(axes)}, or R, G, B" if vectors else "R, G, B"
         raise InputError(
             f"has no channel {missing[0]}, only {', '.join(channels)}",
             file=path,
             key=key,
-            cure="write the normals as channels normal.x, normal.y, normal.z, or R, G, B",
+            cure=f"write the {key.split('.')[0]} as channels {forms}",
         )
-    normals = np.stack([channels[channel] for channel in names], axis=-1)
-    if normals.shape[1::-1] != tuple(size):
+    values = np.stack([channels[channel] for channel in names], axis=-1)
+    if values.shape[1::-1] != tuple(size):
         raise InputError(
-            f"the normals have {normals.shape[1]} × {normals.shape[0]} pixels, the photo {size[0]} × {size[1]}",
+            f"has {values.shape[1]} × {values.shape[0]} pixels, the photo {size[0]} × {size[1]}",
             file=path,
             key=key,
-            cure="render them with the photo's own pixels",
+            cure="render it with the photo's own pixels",
         )
-    if np.isinf(normals).any():
-        raise InputError("a normal is infinite", file=path, key=key, cure="write 0 where the normal is unknown")
-    return normals
+    return values
 
 
 RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
@@ -112,6 +155,41 @@ def average_normals(normal: Float[np.ndarray, "h w 3"], factor: int) -> Float[np
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     enough = (2 * box_sum(known, factor, np.int64) >= factor**2)[..., None] & (length > 0)
     return np.where(enough, mean / np.where(enough, length, 1), 0)
+
+
+def albedo_errors(
+    kinds: Sequence[Float[np.ndarray, "n 3"]],
+    truth: Float[np.ndarray, "n 3"],
+    material: Int[np.ndarray, " n"],
+    names: Sequence[str],
+) -> AlbedoErrors | None:
+    """Return the errors of albedo over pixels; None if there are none.
+
+    Args:
+        kinds: estimated k_d, and that without a texture
+        truth: true k_d, above 0
+        material: index of each pixel's material
+        names: names of the materials
+    """
+    if not len(truth):
+        return None
+    # logarithms of the ratios to the truth, and relative errors after the factor
+    logs = [np.log(np.maximum(kind, 1e-30) / truth) for kind in kinds]
+    relative = [np.abs(np.expm1(log - np.median(log, axis=0))) for log in logs]
+
+    def errors(pixels: Bool[np.ndarray, " n"]) -> ErrorWithNull[RelativeError]:
+        """Return the errors of some pixels, over all channels."""
+        percentiles = [[round(float(np.percentile(each[pixels], q)), 6) for q in (50, 90)] for each in relative]
+        return ErrorWithNull(*(RelativeError(*each) for each in percentiles))
+
+    materials = {name: errors(material == k) for k, name in enumerate(names) if (material == k).any()}
+    return AlbedoErrors(len(truth), vec3(np.exp(-np.median(logs[0], axis=0))), errors(material >= 0), materials)
+
+
+def average_albedo(albedo: Float[np.ndarray, "h w 3"], factor: int) -> Float[np.ndarray, "i j 3"]:
+    """Return mean albedo of boxes of factor × factor pixels, over the pixels where it is known; zero without any."""
+    known = np.asarray((albedo > 0).any(axis=-1))
+    return box_mean(np.where(known[..., None], albedo, 0), known, factor)[0]
 
 
 def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:

@@ -30,6 +30,7 @@ ROUGH = typer.Option(
     help="Give a worse mesh: triangles a part, and a bend as a share of its extent.",
 )
 DIRECT = typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")
+PAINTED = typer.Option("--painted", help="Paint wood and two shells: grain, a print, a patina; with true albedo.")
 Out = Annotated[Path | None, typer.Option(help="Folder to write; default data/<set>. It is replaced.")]
 Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .exr maps to light the set with.")]
 
@@ -74,11 +75,14 @@ def eames(
     distant: Annotated[bool, DISTANT] = False,
     direct: Annotated[bool, DIRECT] = False,
     rough: Annotated[str | None, ROUGH] = None,
+    painted: Annotated[bool, PAINTED] = False,
 ) -> tuple[ModuleType, msgspec.Struct]:
     """Generate six photos of moulded side chairs, path-traced with all bounces, on an approximate mesh."""
     from factorlib.generate import eames as set_
 
-    return set_, set_.ChairSetOptions(exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact))
+    return set_, set_.ChairSetOptions(
+        exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact), painted=painted
+    )
 
 
 def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:

@@ -3,7 +3,7 @@
 It is harder than the synthetic set in the ways of real photographs. Its JPEGs have clipped highlights. Its chairs
 shadow and reflect themselves, each other and the ground. Its mesh is coarser than the rendered chair and a few
 millimetres off. Poses, and half of the focal lengths, are unknown. Three difficulties can be removed one by one, to
-measure the cost of each: `exact` geometry, `distant` light, `direct` light.
+measure the cost of each: `exact` geometry, `distant` light, `direct` light. One can be added: `painted` materials.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,6 +18,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, surroundings
 from factorlib.generate.chair import bent_chair, chair, label_parts, rough_chair
+from factorlib.generate.paint import paint_mesh
 from factorlib.generate.surroundings import EYE, Rng, SceneDict, random_materials
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
@@ -29,6 +30,7 @@ from factorlib.tracing.scene import (
     envmap,
     incident_light,
     look_rotation,
+    paint,
     render_scene,
     rigid,
     sensor,
@@ -39,6 +41,9 @@ from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]
 Maps = Sequence[Path]
+Materials = dict[str, Reflectance]
+Meshes = dict[str, Mesh]
+CHAIR: dict[str, Any] = {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}
 
 
 class ChairSetOptions(msgspec.Struct, frozen=True):
@@ -51,6 +56,7 @@ class ChairSetOptions(msgspec.Struct, frozen=True):
     distant          the light's map, infinitely far away, is the only light and surroundings of the chairs
     direct           light is not reflected on its way: only emitters light the chairs
     rough            the data set's mesh has this number of triangles a part, and is bent by this share of its extent
+    painted          diffuse reflectance varies over wood and two of the shells (`factorlib.generate.paint`)
     """
 
     width: int = 480
@@ -62,6 +68,7 @@ class ChairSetOptions(msgspec.Struct, frozen=True):
     distant: bool = False
     direct: bool = False
     rough: tuple[int, float] | None = None
+    painted: bool = False
 
 
 class ChairShot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -127,19 +134,23 @@ def generate(
     if parameters.rough:
         rough = bent_chair(np.random.default_rng([13, seed]), *parameters.rough)
     parts = {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in exact.items()} or rough
-    folder.write_obj(out / "meshes/chair.obj", parts)
+    folder.write_obj(out / CHAIR["file"], parts)
+    labels = {name: label for label, name in enumerate(materials, start=1)}
+    shells = {colour: labels[colour] for shot in shots for colour in shot.chairs}
+    chairs = {name: label_parts(chair(), {"shell": label, "legs": labels["wood"]}) for name, label in shells.items()}
+    if parameters.painted:
+        chairs = {name: paint_mesh(mesh, seed, materials) for name, mesh in chairs.items()}
     photos = []
     poses = {}
     for number, shot in enumerate(shots):
         progress(number, len(shots), shot.name)
         scene = arrange_scene(shot, number, lat_longs, rng, spread, parameters)
         poses[shot.name] = scene.poses
-        photos.append(write_chair_shot(out, scene, materials, parameters, 1000 * seed + number))
-    meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
-    options = "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(parameters, name))
+        photos.append(write_chair_shot(out, scene, materials, chairs, parameters, 1000 * seed + number))
+    options = "".join(f" --{name}" for name in ("exact", "distant", "direct", "painted") if getattr(parameters, name))
     options += " --rough {},{}".format(*parameters.rough) if parameters.rough else ""
     comment = f"Generated (rendered, not photographed): python -m factorlib.generate eames{options}"
-    folder.write_records(out, comment, materials, meshes, photos, poses)
+    folder.write_records(out, comment, materials, {"chair": CHAIR}, photos, poses)
     progress(len(shots), len(shots), "done")
 
 
@@ -211,14 +222,15 @@ def arrange_scene(
 
 
 def write_chair_shot(
-    out: Path, scene: ChairScene, materials: dict[str, Reflectance], parameters: ChairSetOptions, seed: int
+    out: Path, scene: ChairScene, materials: Materials, chairs: Meshes, parameters: ChairSetOptions, seed: int
 ) -> dict:
-    """Render, expose and write one photo, with its masks, its light in the photo's units, and its normals.
+    """Render, expose and write one photo, with its masks, its light in the photo's units, and its true maps.
 
     Args:
         out: Folder of the data set.
         scene: The scene.
         materials: Materials by name, in the order of their labels.
+        chairs: Chair with a shell of each colour.
         parameters: Parameters of the set.
         seed: Seed of the renderer.
 
@@ -228,10 +240,8 @@ def write_chair_shot(
     """
     shot = scene.shot
     camera = scene.camera
-    names = list(materials)
     poses = list(scene.poses.values())
-    wood = names.index("wood") + 1
-    meshes = [label_parts(chair(), {"shell": names.index(colour) + 1, "legs": wood}) for colour in shot.chairs]
+    meshes = [chairs[colour] for colour in shot.chairs]
     labels = folder.label_pixels(meshes, camera, poses)
     light, radiance = render_shot(scene, meshes, list(materials.values()), parameters, seed)
     # exposure that clips the share `clipped` of the chairs' pixels
@@ -240,6 +250,9 @@ def write_chair_shot(
     exif = shot.focal_35mm if shot.focal_known_from == "exif" else None
     folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, exif)
     folder.write_mask_and_truth(out, shot.name, labels, light * exposure, rasterise(meshes, camera, poses))
+    if parameters.painted:
+        albedo = folder.albedo_map(meshes, list(materials.values()), camera, poses)
+        folder.write_rgb_exr(out / f"truth/{shot.name}_albedo.exr", albedo)
     shells = zip(scene.chairs, shot.chairs, strict=True)
     objects: list[Any] = [{"name": name, "mesh": "chair", "materials": {"shell": colour}} for name, colour in shells]
     if len(meshes) > 1:  # a mask for each chair
@@ -278,10 +291,16 @@ def render_shot(
     if parameters.distant:
         around = {"light": envmap(light) | {"to_world": transform(rigid(world_from_light, (0, 0, 0)))}}
     solids = {
-        f"{name}_{label}": shape(submesh(mesh, label), bsdf(materials[label - 1]), world_from_object)
+        f"{name}_{label}": _part(submesh(mesh, label), materials[label - 1], world_from_object)
         for mesh, (name, world_from_object) in zip(meshes, scene.chairs.items(), strict=True)
         for label in mesh.labels
     }
     depth = 2 if parameters.direct else -1
     film = sensor(scene.camera, scene.world_from_camera)
     return light, render_scene(around | solids, film, parameters.spp, seed, depth)
+
+
+def _part(mesh: Mesh, material: Reflectance, world_from_object: Float[np.ndarray, "4 4"]) -> Any:
+    """Return a part of a chair as a Mitsuba shape, with the colours of its paint if it has any."""
+    colours = None if mesh.detail is None else paint(material, mesh.detail)
+    return shape(mesh, bsdf(material, painted=colours is not None), world_from_object, colours=colours)

@@ -10,11 +10,13 @@ from jaxtyping import Bool, Float, Int
 
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.geometry.raster import Maps, rasterise
+from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import FIXED_DATE, LAT_LONG, encode_pixels, write_exr, write_rgb_exr
+from factorlib.images.photo import box_sum
 from factorlib.images.tone import srgb_encode
 from factorlib.meshes.mesh import Mesh
+from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes, write_text
 from factorlib.yamlfile import yaml_text
 
@@ -135,6 +137,37 @@ def object_masks(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> l
     return [(inside == k + 1).mean(axis=(1, 3)) >= 0.5 for k in range(len(poses))]
 
 
+def albedo_map(
+    meshes: Sequence[Mesh], materials: Sequence[Reflectance], camera: Camera, poses: Sequence[Pose]
+) -> Image:
+    """Return k_d at each pixel: the mean over those of its subpixels that show a mesh, 0 if there are none.
+
+    Args:
+        meshes: Meshes with detail.
+        materials: Materials in the order of their labels.
+        camera: Camera.
+        poses: Pose of each mesh.
+
+    Returns:
+        Albedo.
+    """
+    fine = camera.window(0, 0, 1 / SUBPIXELS, camera.width * SUBPIXELS, camera.height * SUBPIXELS)
+    diffuse = np.array([material.diffuse for material in materials])
+    albedo = np.zeros((fine.height, fine.width, 3))
+    nearest = np.full(albedo.shape[:2], np.inf)
+    for mesh, pose in zip(meshes, poses, strict=True):
+        hits = Caster(mesh).cast(fine, pose)
+        visible = hits.depth < nearest
+        nearest[visible] = hits.depth[visible]
+        # detail at the corners, interpolated by barycentric coordinates
+        face = hits.face[visible]
+        weight = np.column_stack([1 - hits.uv[visible].sum(axis=1), hits.uv[visible]])
+        detail = np.einsum("nk,nkc->nc", weight, np.asarray(mesh.detail)[mesh.faces[face]])
+        albedo[visible] = detail * diffuse[mesh.face_label[face] - 1]
+    covered = box_sum(np.isfinite(nearest), SUBPIXELS)
+    return box_sum(albedo, SUBPIXELS) / np.maximum(covered, 1)[..., None]
+
+
 def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Maps:
     """Render maps on a grid SUBPIXELS times finer, with a border of one pixel."""
     window = camera.window(-1, -1, 1 / SUBPIXELS, (camera.width + 2) * SUBPIXELS, (camera.height + 2) * SUBPIXELS)
@@ -187,6 +220,8 @@ def write_records(
 ) -> None:
     """Write dataset.yaml and truth/truth.yaml of a generated data set.
 
+    The latter names maps of albedo if there are any.
+
     Args:
         out: Folder of the data set.
         comment: First line of dataset.yaml.
@@ -203,5 +238,8 @@ def write_records(
         "normals": {name: f"truth/{name}_normal.exr" for name in poses},
         "poses": {photo: {name: pose_entry(pose) for name, pose in each.items()} for photo, each in poses.items()},
     }
+    albedo = {name: f"truth/{name}_albedo.exr" for name in poses}
+    if any((out / file).is_file() for file in albedo.values()):
+        truth["albedo"] = albedo
     comment = "What the photos were made of; lights in the units of their photos, seen from the objects"
     write_yaml(out / "truth/truth.yaml", truth, comment)

@@ -13,6 +13,7 @@ relighting   `factorlib.evaluate.relighting`
 relit_set    the relit set score of `factorlib.evaluate.relighting`
 light        `factorlib.evaluate.relighting`
 normals      photo -> `NormalError`; see `factorlib.evaluate.truth`
+albedo       `factorlib.evaluate.truth`
 poses        photo -> object -> `PoseError`
 verdict      trust in the result, with or without truth; null if no photo shows a material
 
@@ -256,6 +257,29 @@ class NormalError(msgspec.Struct, frozen=True):
     null: AngleError
 
 
+class RelativeError(msgspec.Struct, frozen=True):
+    """Median and 90th percentile of relative errors; 0 is perfect."""
+
+    median: float
+    p90: float
+
+
+class AlbedoErrors(msgspec.Struct, frozen=True):
+    """Errors of k_d over pixels and channels; the null is the material without its texture.
+
+    Attributes:
+        pixels: number of compared pixels
+        factor: factor on the estimate per channel, for the whole set
+        overall: errors over the pixels of all materials
+        materials: errors by material
+    """
+
+    pixels: int
+    factor: Vec3
+    overall: ErrorWithNull[RelativeError]
+    materials: dict[str, ErrorWithNull[RelativeError]]
+
+
 class PoseError(msgspec.Struct, frozen=True):
     """Errors of a pose.
 
@@ -307,6 +331,7 @@ class Metrics(msgspec.Struct, frozen=True):
     verdict: Verdict | None = None
     held_out: ResynthesisErrors | None = None
     views: dict[str, dict[str, float]] | None = None
+    albedo: AlbedoErrors | None = None
 
     @property
     def photos(self) -> dict[str, PhotoErrors]:

@@ -147,6 +147,7 @@ def test_truth_is_its_own_slice_and_a_warning_where_it_is_missing(folder, caplog
     ({"materials": {"rde": TRUTH["materials"]["red"]}}, "materials.rde", "did you mean 'red'"),
     ({"illumination": {"gardn": "truth/garden.exr"}}, "illumination.gardn", "did you mean 'garden'"),
     ({"normals": {"hal": "truth/garden.exr"}}, "normals.hal", "did you mean 'hall'"),
+    ({"albedo": {"hal": "truth/garden.exr"}}, "albedo.hal", "did you mean 'hall'"),
     ({"poses": {"kitchen": {"vase_2": POSE}}}, "poses.kitchen.vase_2", "did you mean 'vase_1'"),
     ({"illumination": {"garden": "../outside.exr"}}, "illumination.garden", "copy the file"),
 ])  # fmt: skip

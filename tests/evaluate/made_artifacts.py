@@ -105,11 +105,17 @@ def make_artifacts(made: Made) -> Inputs:
             "illumination": {p: f"truth/{p}_env.exr" for p in made.seen},
             "normals": {p: f"truth/{p}_normal.exr" for p in made.seen},
             "poses": {p: {"balls": POSE} for p in made.seen},
+            "albedo": {p: f"truth/{p}_albedo.exr" for p in made.seen},
         },
     }
     facts["dataset.truth"] = facts["dataset.truth"] if made.truth else None
     files = {"ball.obj": made.folder / "ball.obj"} | {f"truth/{file.name}": file for file in truth.iterdir()}
     return Inputs(folders, facts, files)
+
+
+def paint(normals: np.ndarray) -> np.ndarray:
+    """The factor on the diffuse reflectance of every ball, which no picture shows: it is for the true albedo alone."""
+    return 1 + normals[:, :1] * [0.3, 0.2, 0.1]
 
 
 def _balls(names: list[str], make) -> np.ndarray:
@@ -147,6 +153,8 @@ def _photo(made: Made, folders: dict, photo: str, materials: list[str], light_va
     })  # fmt: skip
     write_rgb_exr(folders["truth"] / f"{photo}_env.exr", light_values, LAT_LONG)
     write_exr(folders["truth"] / f"{photo}_normal.exr", normals)
+    albedo = _balls(seen, lambda m, n: TRUE[m].diffuse * paint(n))
+    write_rgb_exr(folders["truth"] / f"{photo}_albedo.exr", albedo)
     write_rgb_exr(folders["export"] / "illumination" / f"{photo}.exr", light_values * 1.1, LAT_LONG)
     again = _balls(seen, lambda m, n: ball(light, perturbed(TRUE[m], made.error), n))
     write_rgb_exr(folders["render"] / "resynthesis" / f"{photo}.exr", again)

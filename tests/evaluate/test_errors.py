@@ -17,9 +17,10 @@ from factorlib.evaluate.picture_errors import (
     white_level,
 )
 from factorlib.evaluate.relighting import compare_lights, compare_relighting, compare_relit_set, light_error, rgb_angle
-from factorlib.evaluate.truth import compare_materials, normal_error, pose_error
+from factorlib.evaluate.truth import albedo_errors, compare_materials, normal_error, pose_error
 from factorlib.geometry.sphere import ball_normals
 from factorlib.results.materials import Reflectance
+from factorlib.results.metrics import RelativeError
 from tests.evaluate.made_artifacts import TRUE, light_map, perturbed, scaled
 from tests.evaluate.made_artifacts import TRUE as ALL
 from tests.integral import reflected
@@ -51,6 +52,28 @@ def test_normals_by_hand_and_only_where_both_are_known():
 # ── materials ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 ONE = dict.fromkeys(TRUE, 0)
+
+
+def test_the_true_albedo_has_no_error_nor_has_it_times_a_factor_per_channel():
+    truth, noise = np.random.default_rng(0).uniform(0.1, 0.9, (2, 500, 3))
+    material = np.zeros(500, int)
+    scores = albedo_errors([truth * [2.0, 0.5, 1.1], noise], truth, material, ["red", "wood"])
+    assert scores.overall.estimate == RelativeError(0, 0) and scores.overall.null.median > 0.2
+    assert scores.factor == pytest.approx((0.5, 2, 1 / 1.1)) and list(scores.materials) == ["red"]
+    again = albedo_errors([noise * [3.0, 0.2, 1.0], noise], truth, material, ["red"])
+    assert again.overall.estimate == again.overall.null == scores.overall.null
+
+
+def test_a_known_error_of_albedo_is_that_number():
+    """Of a hundred pixels a fifth are of wood, whose estimate is 30 % too bright; flat, a quarter is twice as dark."""
+    truth = np.full((100, 3), 0.4)
+    material = np.where(np.arange(100) < 20, 1, 0)
+    kinds = [truth * factor[:, None] for factor in (1 + 0.3 * material, np.where(np.arange(100) < 75, 1, 0.5))]
+    scores = albedo_errors(kinds, truth, material, ["red", "wood", "blue"])
+    assert scores.overall.estimate == RelativeError(0, 0.3) and scores.overall.null == RelativeError(0, 0.5)
+    assert scores.materials["wood"].estimate == RelativeError(0.3, 0.3) and scores.pixels == 100
+    assert scores.materials["red"].estimate == RelativeError(0, 0) and "blue" not in scores.materials
+    assert albedo_errors([each[:0] for each in kinds], truth[:0], material[:0], ["red"]) is None
 
 
 def test_a_factor_per_channel_and_component_is_no_error():

@@ -7,16 +7,18 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.evaluate.ball import ball, octahedral_light, uniform_light
 from factorlib.evaluate.relighting import MEAN_SHOWN, NORMALS
 from factorlib.evaluate.verdict import GOOD, POOR, VerdictInputs, ball_changes, verdict, verdict_text
+from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import read_json
 from factorlib.results.materials import Misfit, Reflectance, StandardErrors, attach_errors
 from factorlib.results.metrics import Metrics, Verdict
 from factorlib.runner.verbs import NO_TRUST
 from factorlib.stage import silent
 from stages import evaluate
-from tests.evaluate.made_artifacts import TRUE, Made, light_map, make_artifacts
+from tests.evaluate.made_artifacts import TRUE, Made, light_map, make_artifacts, paint
 
 LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
 
@@ -54,6 +56,26 @@ def test_every_part_is_scored_beside_its_null_in_finite_numbers(linked):
     assert linked["light"]["mean"]["scalar_per_set"]["mirror"]["estimate"]["rmse"] < 1e-3  # only scaled, by 1.1
     assert linked["normals"]["day"]["estimate"]["median_deg"] < 0.1 < linked["normals"]["day"]["null"]["median_deg"]
     assert linked["poses"]["dusk"]["balls"]["rotation_deg"] == pytest.approx(0)
+
+
+def test_a_texture_is_scored_beside_the_flat_material(tmp_path, linked):
+    flat = linked["albedo"]["overall"]
+    assert flat["estimate"] == flat["null"] and 0.01 < flat["null"]["median"] < flat["null"]["p90"] < 0.4
+    assert set(linked["albedo"]["materials"]) == {"red", "white", "brass"}
+    inputs = make_artifacts(Made(tmp_path / "in", seen=LINKED))
+    folder = tmp_path / "in" / "texture"
+    (folder / "photos").mkdir(parents=True)
+    for photo in LINKED:  # the texture is the paint; the estimated k_d differs by one factor
+        maps = read_exr(inputs["align"] / f"{photo}.exr")
+        normal = np.stack([maps[f"normal.{axis}"] for axis in "xyz"], axis=-1) @ YUP_FROM_CAMERA.T
+        detail = paint(normal.reshape(-1, 3)).reshape(normal.shape) * maps["object"][..., None]
+        write_exr(folder / "photos" / f"{photo}.exr", {f"detail.{c}": detail[..., k] for k, c in enumerate("RGB")})
+    textured = evaluated(
+        msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": folder}), tmp_path / "out"
+    )
+    scores = textured["albedo"]["overall"]
+    assert scores["null"] == flat["null"] and scores["estimate"]["p90"] < 1e-5
+    assert textured["albedo"]["factor"] == pytest.approx([1 / 1.04] * 3, rel=1e-5)
 
 
 def test_a_held_out_photo_is_scored_apart(tmp_path, linked):

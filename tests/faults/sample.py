@@ -22,7 +22,7 @@ import yaml
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import PhotoSlice
 from factorlib.dataset.slices import SLICES, dataset_slice
-from factorlib.evaluate.truth import read_true_light, read_true_normals
+from factorlib.evaluate.truth import read_true_albedo, read_true_light, read_true_normals
 from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.jsonfile import read_json
 from factorlib.labels.label_image import read_labels
@@ -215,6 +215,7 @@ TRUTH = {
     "materials": {"red": {"diffuse": [0.5, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.3}},
     "illumination": {"hall": "light.exr"},
     "normals": {"room": "normals.exr"},
+    "albedo": {"room": "albedo.exr"},
     "poses": {"hall": {"vase": PLACE}},
 }
 STDERR = {"diffuse": [0.1, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.1}
@@ -257,6 +258,7 @@ def make_set(folder: Path) -> Path:
     (folder / "dataset.yaml").write_text(yaml.safe_dump(DATASET))
     write_rgb_exr(folder / "light.exr", np.ones((4, 8, 3)))
     write_exr(folder / "normals.exr", {f"normal.{a}": np.full((H, W), v, np.float32) for a, v in zip("xyz", (0, 0, 1))})
+    write_rgb_exr(folder / "albedo.exr", np.full((H, W, 3), 0.3))
     write_lobes(folder / "solve" / "lobes.parquet", {"hall": Lobes(np.eye(3), np.ones(3), np.ones((3, 3)))})
     write_observations(folder / "observations.parquet", observations())
     return folder
@@ -361,6 +363,7 @@ READERS = {  # reader -> who reads a file of the data set's folder
     "true maps": validated("truth"),
     "true light": lambda folder, name: read_true_light(folder / name, "hall"),
     "true normals": lambda folder, name: read_true_normals(folder / name, "hall", (W, H)),
+    "true albedo": lambda folder, name: read_true_albedo(folder / name, "hall", (W, H)),
     "observations": lambda folder, name: read_observations(folder / name),
     "lobes": lambda folder, name: read_lobes(folder / name),
     "solution": lambda folder, _: read_earlier_solution(folder / "solve"),

@@ -83,6 +83,7 @@ PATHS = {  # every path that dataset.yaml and truth.yaml may hold, and the suffi
     ("photos", 0, "objects", 0, "mask"): ".png", ("meshes", "vase", "file"): ".ply", ("truth",): ".yaml",
     ("cameras", "colmap"): "", ("cameras", "transforms"): ".json", ("cameras", "bop"): "",
     ("illumination", "hall"): ".exr", ("normals", "room"): ".exr",
+    ("albedo", "room"): ".exr",
 }  # fmt: skip
 MOST_MEMORY = 60_000_000  # bytes: what a file of some kB may take
 MOST_SECONDS = 10.0  # of processor time
@@ -345,6 +346,7 @@ REFUSED = {
         (OBJ.replace("v 1.0", "v nan"), "not finite"),
     ],
     ("objects", "buffers/b 1.bin"): [(DATA[:30], "has 30 bytes, but the header states 72")],
+    ("true maps", "albedo.exr"): [(widened(60_000, 30_000), "million values"), (channels(R=0, G=0, B=2), "albedo.room")],
     ("true maps", "normals.exr"): [(widened(60_000, 30_000), "million values")],
     ("true maps", "light.exr"): [
         (widened(60_000, 30_000), "million values"),
@@ -389,8 +391,13 @@ REFUSED = {
     ("true normals", "n.exr"): [
         (channels(R=0, G=0), "has no channel B"), (channels(**{"normal.x": 0, "normal.y": 0}),
         "has no channel normal.z"),
-        (channels((6, 8), R=0, G=0, B=1), "the normals have 8 × 6 pixels, the photo 16 × 12"),
+        (channels((6, 8), R=0, G=0, B=1), "normals.hall: has 8 × 6 pixels, the photo 16 × 12"),
         (channels(R=0, G=0, B=np.inf), "infinite"),
+    ],
+    ("true albedo", "n.exr"): [
+        (channels(R=0, G=0), "albedo.hall: has no channel B"),
+        (channels((6, 8), R=0, G=0, B=1), "albedo.hall: has 8 × 6 pixels, the photo 16 × 12"),
+        *((channels(R=0, G=0, B=value), "albedo.hall: an albedo is") for value in (np.inf, -0.1, 1.2)),
     ],
     ("observations", "a.parquet"): [
         (with_values(material=np.full(5, 1)), "'material' has an index without a name"),
@@ -505,6 +512,7 @@ READ = [  # what is odd and legal: reader, file, what is in it
     ("transforms", "t.json", transforms(stamp=1.7e18, note=[[[]]])),
     ("true light", "light.exr", light_of(-1e-4)),  # what resampling leaves
     ("true normals", "n.exr", channels(**{f"normal.{axis}": np.nan for axis in "xyz"})),
+    ("true albedo", "n.exr", channels(R=np.nan, G=0, B=1)),
     ("masks", "7.png", sample.PHOTO), ("true maps", "light.exr", lambda path: None),
     ("solution", "solve/materials.json", lambda path: None), ("json", "coco.json", sample.COCO),
 ]  # fmt: skip

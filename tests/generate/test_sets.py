@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -10,10 +11,14 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.generate import eames, folder, surroundings, synthetic
 from factorlib.generate.chair import chair, label_parts
+from factorlib.generate.paint import choose_patterns, paint_mesh
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
 from factorlib.light.latlong import sample_map
+from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.read_mesh import read_mesh
 from tests.refusal import refusal
 from tests.runner.toy import files_of
@@ -28,9 +33,9 @@ def made(out: Path, seed: int) -> Path:
     return out
 
 
-def made_chairs(out: Path, names=("kitchen",), **easier: bool) -> Path:
+def made_chairs(out: Path, names=("kitchen",), spp: int = 8, **easier: bool) -> Path:
     """A small chair set of seed 3."""
-    parameters = eames.ChairSetOptions(width=96, height=72, light_rows=16, spp=8, light_spp=2, **easier)
+    parameters = eames.ChairSetOptions(width=96, height=72, light_rows=16, spp=spp, light_spp=2, **easier)
     shots = [shot for shot in eames.SET.shots if shot.name in names]
     eames.generate(out, 3, [], parameters, lambda done, total, text: None, shots)
     return out
@@ -100,3 +105,83 @@ def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
     assert alike.mean() > 0.97, (
         "of flat ends of legs, which stand on the floor or in the seat, the reader takes its own"
     )
+
+
+# ── painted chairs ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory) -> list[Path]:
+    """A set without paint and the same with paint; the photo shows a red chair."""
+    folder = tmp_path_factory.mktemp("sets")
+    names = ("office",)
+    return [made_chairs(folder / str(painted), names, 32, exact=True, painted=painted) for painted in (False, True)]
+
+
+def test_the_same_seed_is_the_same_paint(office, tmp_path):
+    again = made_chairs(tmp_path / "again", ("office",), 32, exact=True, painted=True)
+    assert files_of(again) == files_of(office[1])
+
+
+def test_paint_changes_pictures_and_nothing_else(office):
+    """A set without paint has the same mesh, masks, normals, poses and materials, and no albedo."""
+    plain, painted = map(files_of, office)
+    assert set(painted) ^ set(plain) == {"truth/office_albedo.exr"}
+    changed = {name for name in plain if plain[name] != painted[name]}
+    normal, painted_normal = (read_exr(each / "truth/office_normal.exr")["normal.x"] for each in office)
+    assert np.abs(normal - painted_normal).max() < 0.05  # the painted mesh has shorter edges
+    maps = {"truth/office_light.exr", "truth/office_normal.exr", "truth/truth.yaml"}
+    assert changed == {"photos/office.jpg", "dataset.yaml", *maps}
+    plain_truth, truth = (read_dataset(each).truth for each in office)
+    assert truth == msgspec.structs.replace(plain_truth, albedo={"office": "truth/office_albedo.exr"})
+
+
+def test_a_photo_shows_the_paint(office):
+    """The photo over that without paint has, in logarithms, the contrast of albedo over k_d, less what gloss adds."""
+    plain, painted = (read_photo(each / "photos/office.jpg").radiance for each in office)
+    labels = read_png(office[1] / "masks/office.png")[..., 0]
+    albedo = read_rgb_exr(office[1] / "truth/office_albedo.exr")
+    materials = read_dataset(office[1]).truth.materials
+    pixels = labels == 1 + list(materials).index("red")
+    assert (albedo[(labels > 0) & (labels < 255)] > 0).all()
+    expected = np.log(albedo[pixels] / materials["red"].diffuse)[:, 0]
+    actual = np.log(painted[pixels] / plain[pixels])[:, 0]
+    assert 0.6 < np.polyfit(expected, actual, 1)[0] < 1.1  # the noise of few samples is 0.1
+
+
+def painted_chair(colour: str) -> Mesh:
+    """The chair of seed 0 with a shell of this colour."""
+    names = list(eames.SET.materials)
+    parts = label_parts(chair(), {"shell": names.index(colour) + 1, "legs": names.index("wood") + 1})
+    return paint_mesh(parts, 0, eames.SET.materials)
+
+
+@pytest.mark.parametrize("colour", ["red", "yellow", "white"])
+def test_the_mean_factor_over_a_material_is_1_within_bounds(colour):
+    mesh = painted_chair(colour)
+    area = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
+    patterns = choose_patterns(0, eames.SET.materials)
+    for label in mesh.labels:
+        name, material = list(eames.SET.materials.items())[label - 1]
+        detail = mesh.detail[mesh.faces[mesh.face_label == label]]
+        mean = np.average(detail.mean(axis=1), axis=0, weights=area[mesh.face_label == label])
+        assert mean == pytest.approx(np.ones(3), abs=1e-9) and 0.3 <= detail.min() <= detail.max() <= 2
+        assert (detail * material.mixture[1]).max() <= 1 + 1e-9, "the renderer clips nothing"
+        assert ((detail.std(axis=(0, 1)) > 0.1) == (name in patterns)).all() and len(patterns) == 3
+
+
+def test_paint_belongs_to_the_surface():
+    """Two cameras that look at the same points from elsewhere find the same albedo there."""
+    mesh = painted_chair("yellow")
+    camera = Camera(64, 64, 1500.0, (32.0, 32.0))
+    views = []
+    for turn in (0.0, 0.35):
+        rotation = rotation_of_vector(np.array([0, np.pi + turn, 0])) @ np.diag([-1.0, -1.0, 1.0])
+        pose = Pose(rotation.T, -rotation.T @ np.array([0, 0.62, -0.1]) + [0, 0, 2.0])
+        depth = rasterise(mesh, camera, pose).depth
+        points = ((depth[..., None] * camera.rays())[depth > 0] - pose.translation) @ pose.rotation
+        albedo = folder.albedo_map([mesh], list(eames.SET.materials.values()), camera, [pose])
+        views.append((points, np.log(albedo[depth > 0])))
+    apart, nearest = cKDTree(views[1][0]).query(views[0][0])
+    log, other = views[0][1][apart < 0.001], views[1][1][nearest[apart < 0.001]]
+    assert len(log) > 500 and (log.std(axis=0) > 0.1).all() and np.quantile(np.abs(log - other), 0.95) < 0.02

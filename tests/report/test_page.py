@@ -92,7 +92,17 @@ def test_it_is_well_formed_has_every_section_and_asks_for_nothing_outside_the_fi
     result = parsed(report_page[2])
     tables = {
         f"table-{key}"
-        for key in ("resynthesis", "materials", "relighting", "unobserved", "light", "normals", "poses", "views")
+        for key in [
+            "resynthesis",
+            "materials",
+            "relighting",
+            "unobserved",
+            "light",
+            "normals",
+            "albedo",
+            "poses",
+            "views",
+        ]
     }
     assert CONTENTS | tables <= set(result.ids) and len(set(result.ids)) == len(result.ids)
     files = [link for link in result.links if link.startswith("../")]  # followed, never asked for
