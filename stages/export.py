@@ -6,6 +6,7 @@ illumination/<light>.exr, .hdr   Environment maps; a light with suns also gets <
 coverage/<light>.exr             Standard error of radiance over its mean, in the same layout.
 materials.json, lobes.parquet, exposures.json, lights.json
 scenes/<photo>.xml               Mitsuba scenes, with meshes and lights; the same scenes for Blender and as OpenUSD.
+scenes/meshes/<mesh>.<material>.png  Diffuse reflectance of a painted part as an image.
 materials.mtlx, <mesh>.glb, meshes/<mesh>.ply
 losses.json                      Properties that each format cannot express.
 dataset.json, source/            Facts and meshes of the dataset, for new pictures of the result.
@@ -109,6 +110,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         light = ExposedMap(f"../illumination/{slice_.illumination}.exr", exposure, turn)
         scene = ExportedScene(camera, shapes, materials, light, depth)
         _write_scenes(out / "scenes", photo, scene, solved[slice_.illumination], params)
+    images = {f"scenes/{file}": name for file, name in files.images.items()}
+    write_text(out / "materials.mtlx", materialx(materials, images))
     progress(total, total)
 
 
@@ -135,7 +138,6 @@ def _solution_in_gauge(
 def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mapping[str, Lobes]) -> None:
     """Write the tables of lobes and suns, materials for other programs, and what these show of them."""
     write_lobes(out / "lobes.parquet", lights)
-    write_text(out / "materials.mtlx", materialx(materials))
     write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
     suns = {name: [sun.to_dict() for sun in extract_suns(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:

@@ -5,7 +5,8 @@ exported as `blender.py`) and needs nothing but Blender.  A `.blend` file would 
 be the same bytes twice.  The JSON has, in plain numbers:
 
     camera     width, height, focal_px, principal_point in pixels, centres at 0.5
-    shapes     name, file (relative), material, cam_from_object: 4 × 4, rows, mesh units, OpenCV's camera axes
+    shapes     name, file (relative), material, cam_from_object: 4 × 4, rows, mesh units, OpenCV's camera axes;
+               only if painted: image (relative), k_d in sRGB by the file's texture coordinates s, t
     materials  diffuse k_d, specular k_s (linear Rec. 709), roughness
     light      file (relative): lat-long map of texel means, exposure: factor per channel, camera_from_light: 3 × 3
     suns       not in the map: direction (toward it, y-up camera frame), irradiance (RGB), angular_diameter_deg
@@ -18,7 +19,7 @@ Frame  The camera frame turned y-up (x right, y up, z toward the viewer), the ca
 
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import msgspec
@@ -43,7 +44,7 @@ class ExportedShape(msgspec.Struct, frozen=True):
     Attributes:
         file: relative to the scene
         two_sided: True if the inside can be visible
-        painted: True if the diffuse part has the colours of the file's vertices
+        painted: True if k_d has detail: the colours of the file's vertices, and `image` by texture coordinates
     """
 
     name: str
@@ -52,6 +53,11 @@ class ExportedShape(msgspec.Struct, frozen=True):
     cam_from_object: Float[np.ndarray, "4 4"]
     two_sided: bool
     painted: bool = False
+
+    @property
+    def image(self) -> str:
+        """The file of a painted shape's k_d as an sRGB image, relative to the scene."""
+        return str(PurePosixPath(self.file).with_suffix(".png"))
 
     @property
     def world_from_object(self) -> Float[np.ndarray, "4 4"]:
@@ -143,7 +149,10 @@ def write_scene_json(path: str | Path, scene: ExportedScene) -> None:
                 "focal_px": camera.focal,
                 "principal_point": camera.centre,
             },
-            "shapes": [_to_dict(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
+            "shapes": [
+                _to_dict(shape, "name", "file", "material", "cam_from_object", *["image"] * shape.painted)
+                for shape in scene.shapes
+            ],
             "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
             "light": _to_dict(scene.light, "file", "exposure", "camera_from_light"),
             "suns": [sun.to_dict() for sun in scene.suns],

@@ -24,10 +24,12 @@ import msgspec
 import numpy as np
 import trimesh
 from jaxtyping import Int
+from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from factorlib.export.exported_scene import Sun
+from factorlib.export.texture_atlas import bake, unwrap
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
@@ -51,8 +53,8 @@ def write_glb(
 ) -> None:
     """Write a mesh in its own frame and units, with the materials of its parts.
 
-    Detail of diffuse reflectance becomes vertex colours, by which glTF multiplies the base colour.  Neither may exceed
-    1.  The base colour takes the largest factor up to that limit; brighter vertices are clamped.
+    Detail of diffuse reflectance becomes an image, by which glTF multiplies the base colour of every variant.  Neither
+    may exceed 1.  The base colour takes the largest factor up to that limit; brighter texels are clamped.
 
     Args:
         path: the file to write
@@ -70,15 +72,16 @@ def write_glb(
         part = submesh(split, label)
         selected = [names[k - 1] for k in choices[:, label - 1]]
         name = selected[0] if selected[0] not in parts else f"{selected[0]} {label}"
-        visual = TextureVisuals(material=PBRMaterial(name=name))
         factor = 1.0
+        texture = None
         if part.detail is not None:
             cores = [gltf_material(materials[each], True)["pbrMetallicRoughness"] for each in selected]
-            # vertex colours in [0, 1]; the base colour takes their largest value, up to 1 itself
+            # values of the image in [0, 1]; the base colour takes their largest value, up to 1 itself
             bases = [core["baseColorFactor"][:3] for core in cores]
             factor = min(float(part.detail.max()), 1 / max(float(np.max(bases)), 1e-9))
-            shade = np.rint(255 * np.minimum(part.detail / factor, 1)).astype(np.uint8)
-            visual.vertex_attributes["color"] = np.column_stack([shade, np.full(len(shade), 255, np.uint8)])
+            part = unwrap(part)
+            texture = Image.fromarray(bake(part, 1 / factor))
+        visual = TextureVisuals(part.uv, PBRMaterial(name=name, baseColorTexture=texture))
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
         painted = part.detail is not None
@@ -101,12 +104,16 @@ def _set_materials(
     """Set the materials and variants of a glTF tree exactly.
 
     The mesh library rounds numbers to eight bits and knows no variants.  `parts` gives the materials of each mesh by
-    name: its own first, then one per variant.
+    name: its own first, then one per variant.  All of a mesh have the texture that the library wrote for it.
     """
+    written = tree["materials"]
     tree["materials"] = materials = []
     for mesh in tree["meshes"]:
         numbers = []
-        for entry in parts[mesh["name"]]:
+        core = written[mesh["primitives"][0]["material"]].get("pbrMetallicRoughness", {})
+        texture = {key: value for key, value in core.items() if key == "baseColorTexture"}
+        for plain in parts[mesh["name"]]:
+            entry = plain | {"pbrMetallicRoughness": plain["pbrMetallicRoughness"] | texture}
             if entry not in materials:
                 materials.append(entry)
             numbers.append(materials.index(entry))
@@ -155,7 +162,7 @@ def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
 def gltf_material(material: Reflectance, painted: bool = False) -> dict[str, Any]:
     """Return the reflectance part of a glTF material.
 
-    A `painted` material has vertex colours, which hold detail of k_d.  It is never written as a metal.
+    A `painted` material has a texture, which holds detail of k_d.  It is never written as a metal.
     """
     brightest = max(material.specular)
     if brightest > 0 and max(material.diffuse) <= METAL * brightest and not painted:

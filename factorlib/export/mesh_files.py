@@ -1,4 +1,4 @@
-"""Mesh files that scenes refer to, as PLY and OpenUSD: one file for each part of one material."""
+"""Mesh files that scenes refer to: for each part of one material PLY, OpenUSD and, if it is painted, an image."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,7 +7,9 @@ import numpy as np
 
 from factorlib.dataset.schema import MeshEntry, MeshInstance
 from factorlib.export.exported_scene import ExportedShape
-from factorlib.export.usd import SUFFIX, colours, write_usd_mesh
+from factorlib.export.texture_atlas import bake, unwrap
+from factorlib.export.usd import SUFFIX, write_usd_mesh
+from factorlib.images.picture import write_png
 from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read_mesh import MeshCache
 from factorlib.results.materials import Reflectance
@@ -28,7 +30,8 @@ class MeshFiles:
         scenes: the folder of the scenes, which file names are relative to
         materials: names by label, from 1
         crease_deg: crease angle for vertex normals, degrees
-        solved: reflectances, which colour the vertices of meshes with detail
+        solved: reflectances, which colour meshes with detail
+        images: material of each image that was written, by its file, relative to `scenes`
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class MeshFiles:
         surface = read_surface(inputs.folders.get("surface"))
         textures = read_textures(inputs.folders.get("texture"))
         self.read = MeshCache(inputs.mesh, materials, crease_deg, surface.displacements, surface.log_factors, textures)
+        self.images: dict[str, str] = {}
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 
     def shapes(
@@ -70,10 +74,15 @@ class MeshFiles:
             for label, name in names.items():
                 part = submesh(mesh, label)
                 file = self.scenes / f"{self._stems[key]}.{name}"
-                detail = part.detail
-                write_ply(f"{file}.ply", part, None if detail is None else paint(self.solved[name], detail))
-                shades = None if detail is None else colours(self.solved[name], detail)
-                write_usd_mesh(f"{file}{SUFFIX}", part, shades)
+                shades = None
+                if part.detail is not None:
+                    part = unwrap(part)
+                    assert part.detail is not None
+                    shades = paint(self.solved[name], part.detail)
+                    write_png(f"{file}.png", bake(part, np.array(self.solved[name].diffuse)))
+                    self.images[f"{self._stems[key]}.{name}.png"] = name
+                write_ply(f"{file}.ply", part, shades)
+                write_usd_mesh(f"{file}{SUFFIX}", part)
         stem = self._stems[key]
         painted = mesh.detail is not None
         return [

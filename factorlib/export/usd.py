@@ -8,6 +8,8 @@ Camera    Apertures are fractions of FILM; their offset is the picture's middle,
 Light     A dome light's map has OpenEXR's layout, as the exported maps have it.
 Material  UsdPreviewSurface: GGX of α = roughness², Schlick's F from F0 to F90, diffuseColor × (1 − F) per channel
           (`shader_inputs`).
+Texture   A painted part has a material of its own, whose diffuseColor is the part's image of k_d (sRGB), times
+          1 / (1 − k_s).
 Meshes    A file for each part of one material, beside the PLY file, to which scenes refer.
 Names     Every prim has the name from the data set as displayName.  Its identifier is that name if USD allows it
           (`identifiers`).
@@ -30,7 +32,6 @@ from factorlib.wholefile import write_text
 # Width of the film in tenths of a unit, 36 mm if a unit is a metre.  Only its ratio to the focal length matters.
 FILM = 0.36
 SUFFIX = ".usda"
-PAINTED = " (painted)"  # suffix of a material whose diffuse part has the colours of vertices
 INDENT = "    "
 UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # The size of a unit of the poses in metres is unknown.
 ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
@@ -41,7 +42,7 @@ def write_usd_scene(path: str | Path, scene: ExportedScene) -> None:
 
     It refers to the files that `write_usd_mesh` writes beside the shapes' own.
     """
-    named = identifiers(sorted({shape.material + PAINTED * shape.painted for shape in scene.shapes}))
+    named = identifiers(sorted({_look(shape) for shape in scene.shapes}))
     parts = [*_camera(scene), *_light(scene.light), *_materials(scene, named), *_objects(scene.shapes, named)]
     size = f"uniform int2 resolution = ({scene.camera.width}, {scene.camera.height})"
     settings = _prim('RenderSettings "photo"', ["rel camera = </scene/camera>", size])
@@ -49,13 +50,10 @@ def write_usd_scene(path: str | Path, scene: ExportedScene) -> None:
     write_text(path, _layer(about, [*_prim('Xform "scene"', parts), *_prim('Scope "Render"', settings)]))
 
 
-def write_usd_mesh(path: str | Path, mesh: Mesh, colours: Float[np.ndarray, "v 3"] | None = None) -> None:
+def write_usd_mesh(path: str | Path, mesh: Mesh) -> None:
     """Write a mesh as the prim /mesh in its own frame and units, as float32 and without a material.
 
-    Args:
-        path: the file to write
-        mesh: the mesh
-        colours: colours of the vertices, written as `displayColor`
+    Its texture coordinates, if it has any, are the primvar `st`.
     """
     points, normals = (array.astype(np.float32).astype(float) + 0.0 for array in (mesh.vertices, mesh.normals))
     lines = [
@@ -69,8 +67,8 @@ def write_usd_mesh(path: str | Path, mesh: Mesh, colours: Float[np.ndarray, "v 3
         f"point3f[] points = [{_tuples(points)}]",
         'uniform token subdivisionScheme = "none"',
     ]
-    if colours is not None:
-        lines += [f"color3f[] primvars:displayColor = [{_tuples(colours)}] (", f'{INDENT}interpolation = "vertex"', ")"]
+    if mesh.uv is not None:
+        lines += [f"texCoord2f[] primvars:st = [{_tuples(mesh.uv)}] (", f'{INDENT}interpolation = "vertex"', ")"]
     write_text(path, _layer(['defaultPrim = "mesh"', *UP_AXIS], _prim('Mesh "mesh"', lines)))
 
 
@@ -87,11 +85,6 @@ def shader_inputs(material: Reflectance) -> dict[str, float | np.ndarray]:
         return {"diffuseColor": specular, "metallic": 1.0, "roughness": roughness, "useSpecularWorkflow": 0}
     base = np.divide(diffuse, 1 - specular, out=np.zeros(3), where=specular < 1)
     return {"diffuseColor": base, "roughness": roughness, "specularColor": specular, "useSpecularWorkflow": 1}
-
-
-def colours(material: Reflectance, detail: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """Return diffuseColor at the vertices of a mesh with detail."""
-    return np.minimum(detail * shader_inputs(material)["diffuseColor"], 1.0)
 
 
 def with_roughness_of_file(material: Reflectance) -> Reflectance:
@@ -150,26 +143,52 @@ def _light(light: ExposedMap) -> list[str]:
     return _prim('DomeLight "light"', [*lines, *_transform(light.world_from_light)])
 
 
+def _look(shape: ExportedShape) -> str:
+    """Return the name of a shape's material in the scene; each painted part has its own."""
+    return f"{shape.material} ({PurePosixPath(shape.file).stem})" if shape.painted else shape.material
+
+
 def _materials(scene: ExportedScene, named: Mapping[str, str]) -> list[str]:
     lines = []
+    shapes = {_look(shape): shape for shape in scene.shapes}
     for name, identifier in named.items():
         shader = ['uniform token info:id = "UsdPreviewSurface"']
-        for key, value in shader_inputs(scene.materials[name.removesuffix(PAINTED)]).items():
-            if key == "diffuseColor" and name.endswith(PAINTED):
-                shader.append(f"color3f inputs:{key}.connect = </scene/materials/{identifier}/colours.outputs:result>")
+        path = f"/scene/materials/{identifier}"
+        inputs = shader_inputs(scene.materials[shapes[name].material])
+        textured = shapes[name].painted and inputs["useSpecularWorkflow"] == 1  # a metal has no k_d
+        for key, value in inputs.items():
+            if key == "diffuseColor" and textured:
+                shader.append(f"color3f inputs:{key}.connect = <{path}/texture.outputs:rgb>")
             elif isinstance(value, np.ndarray):
                 shader.append(f"color3f inputs:{key} = {_tuple(value)}")
             elif isinstance(value, int):
                 shader.append(f"int inputs:{key} = {value}")
             else:
                 shader.append(f"float inputs:{key} = {_number(value)}")
-        surface = f"token outputs:surface.connect = </scene/materials/{identifier}/surface.outputs:surface>"
+        surface = f"token outputs:surface.connect = <{path}/surface.outputs:surface>"
         about = [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])]
-        if name.endswith(PAINTED):
-            read = ['uniform token info:id = "UsdPrimvarReader_float3"', 'string inputs:varname = "displayColor"']
-            about += _prim('Shader "colours"', [*read, "float3 outputs:result"])
+        if textured:
+            about += _texture(path, shapes[name], scene.materials[shapes[name].material])
         lines += _prim(f'Material "{identifier}"', about, _display_name(name))
     return _prim('Scope "materials"', lines)
+
+
+def _texture(path: str, shape: ExportedShape, material: Reflectance) -> list[str]:
+    """Return the shaders that look up diffuseColor, k_d / (1 − k_s), in a painted shape's image of k_d."""
+    specular = np.array(material.specular)
+    scale = np.divide(1, 1 - specular, out=np.zeros(3), where=specular < 1)
+    texture = [
+        'uniform token info:id = "UsdUVTexture"',
+        f"asset inputs:file = {_asset(f'./{shape.image}')}",
+        f"float4 inputs:scale = {_tuple([*scale, 1.0])}",
+        'token inputs:sourceColorSpace = "sRGB"',
+        f"float2 inputs:st.connect = <{path}/coordinates.outputs:result>",
+        'token inputs:wrapS = "clamp"',
+        'token inputs:wrapT = "clamp"',
+        "float3 outputs:rgb",
+    ]
+    read = ['uniform token info:id = "UsdPrimvarReader_float2"', 'string inputs:varname = "st"']
+    return [*_prim('Shader "texture"', texture), *_prim('Shader "coordinates"', [*read, "float2 outputs:result"])]
 
 
 def _objects(shapes: Sequence[ExportedShape], materials: Mapping[str, str]) -> list[str]:
@@ -181,7 +200,7 @@ def _objects(shapes: Sequence[ExportedShape], materials: Mapping[str, str]) -> l
     for name, identifier in identifiers(objects).items():
         about = _transform(objects[name][0].world_from_object)
         for shape in objects[name]:
-            material = materials[shape.material + PAINTED * shape.painted]
+            material = materials[_look(shape)]
             file = PurePosixPath(shape.file).with_suffix(SUFFIX)
             references = f"prepend references = {_asset(f'./{file}')}"
             head = ['prepend apiSchemas = ["MaterialBindingAPI"]', *_display_name(shape.material), references]
@@ -229,6 +248,7 @@ def _tuple(values: Iterable[float]) -> str:
     return f"({', '.join(_number(value) for value in values)})"
 
 
-def _tuples(rows: Float[np.ndarray, "n 3"]) -> str:
+def _tuples(rows: Float[np.ndarray, "n c"]) -> str:
     """Format rows with nine digits, which distinguish all float32."""
-    return ", ".join(["(%.9g, %.9g, %.9g)"] * len(rows)) % tuple(rows.reshape(-1).tolist())
+    row = f"({', '.join(['%.9g'] * rows.shape[1])})"
+    return ", ".join([row] * len(rows)) % tuple(rows.reshape(-1).tolist())

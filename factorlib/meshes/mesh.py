@@ -25,6 +25,7 @@ class Mesh(msgspec.Struct, frozen=True):
     face_label  [F] int16, material label k = position in the dataset's `materials`, from 1
     open        True if the surface has a border, so that its inside can be visible
     detail      [V, 3] factor on the diffuse reflectance of the material; None: 1
+    uv          [V, 2] texture coordinates in the unit square, v upward; None: it has no texture
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -33,6 +34,7 @@ class Mesh(msgspec.Struct, frozen=True):
     face_label: Int[np.ndarray, " f"]
     open: bool = False
     detail: Float[np.ndarray, "v 3"] | None = None
+    uv: Float[np.ndarray, "v 2"] | None = None
 
     @property
     def labels(self) -> tuple[int, ...]:

@@ -206,11 +206,12 @@ def write_ply(path: str | Path, mesh: Mesh, colours: np.ndarray | None = None) -
 
     Args:
         path: File to write.
-        mesh: The mesh; its detail is three further properties per vertex.
+        mesh: The mesh; its detail is three further properties per vertex, its texture coordinates are two (s, t).
         colours: Linear colours [v, 3] of the vertices (red, green, blue), in place of the detail.
     """
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     further = {"red green blue": colours} if colours is not None else {"detail_r detail_g detail_b": mesh.detail}
+    further |= {"s t": mesh.uv}
     further = {name: values.reshape(len(values), -1) for name, values in further.items() if values is not None}
     columns = [mesh.vertices, mesh.normals, *further.values()]
     lines += [f"property float {name}" for name in " ".join(["x y z nx ny nz", *further]).split()]

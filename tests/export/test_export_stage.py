@@ -29,6 +29,7 @@ from factorlib.results.materials import Gauge, MaterialTable, Reflectance, Stand
 from factorlib.stage import silent
 from stages import export
 from tests.export import made_export
+from tests.export.test_textures import colours_at
 from tests.refusal import refusal
 from tests.runner.toy import files_of
 
@@ -193,7 +194,9 @@ def test_materialx_is_valid_where_its_library_is_there():
     document, standard = library.createDocument(), library.createDocument()
     library.loadLibraries(library.getDefaultDataLibraryFolders(), library.getDefaultDataSearchPath(), standard)
     document.importLibrary(standard)
-    library.readFromXmlString(document, materialx(CASES))
+    library.readFromXmlString(
+        document, materialx(CASES, {"scenes/meshes/a.bright.png": "bright", "b.metal.png": "metal"})
+    )
     assert document.validate() == (True, "")
 
 
@@ -250,18 +253,19 @@ def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
 
 
 def test_variants_share_the_detail_of_reflectance_exactly(tmp_path):
-    """Base colour times vertex colour is the reflectance times the detail, in each variant."""
+    """Base colour times the image at a vertex is the reflectance times the detail, in each variant."""
     detail, labels = np.array([[0.4, 0.5, 0.6], [0.8, 0.7, 0.6], [1.05, 1.0, 0.9]]), np.array([1], np.int16)
     mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.tile([0.0, 0, 1], (3, 1)), labels, detail=detail)
     write_glb(
         tmp_path / "a.glb", mesh, ["bright", "lambertian", "metal"], CASES, {"dim": labels + 1, "bare": labels + 2}
     )
     ((_, part),) = trimesh.load(tmp_path / "a.glb").geometry.items()
-    shade = part.visual.vertex_attributes["color"][:, :3] / 255
+    source = np.abs(part.vertices[:, None] - mesh.vertices).sum(-1).argmin(1)
+    shade = colours_at(np.asarray(part.visual.material.baseColorTexture), part.visual.uv)
     for entry in read_tree(tmp_path / "a.glb")["materials"]:
         material = CASES[entry["name"]]
         base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3]) * (1 - max(material.specular))
-        np.testing.assert_allclose(base * shade, detail * material.diffuse, atol=0.005)
+        np.testing.assert_allclose(base * shade, detail[source] * material.diffuse, atol=0.005)
 
 
 def read_tree(path) -> dict:

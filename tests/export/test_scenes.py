@@ -315,12 +315,15 @@ def blender_pictures(scenes: Path, photos: Sequence[str], samples: int) -> dict[
 
 @pytest.mark.long
 def test_round_trip_shows_what_mitsuba_shows(exported):
-    inputs, out = exported
-    photos, module = list(made_export.MESHES), mitsuba()
-    result = blender_pictures(out / "scenes", photos, 256)
+    agree(exported[0]["align"], exported[1] / "scenes", list(made_export.MESHES))
+
+
+def agree(align: Path, scenes: Path, photos: Sequence[str]) -> None:
+    """Blender's pictures of the scenes are Mitsuba's."""
+    module, result = mitsuba(), blender_pictures(scenes, photos, 256)
     for photo in photos:
-        expected = np.array(module.render(module.load_file(str(out / "scenes" / f"{photo}.xml")), spp=512))
-        mask = binary_erosion(read_exr(inputs["align"] / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
+        expected = np.array(module.render(module.load_file(str(scenes / f"{photo}.xml")), spp=512))
+        mask = binary_erosion(read_exr(align / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
         error = np.abs(result[photo][mask][:, :3] / expected[mask] - 1)
         print(f"{photo}: difference {np.median(error):.2%} (median), {np.percentile(error, 95):.2%} (95th percentile)")
         assert np.median(error) <= 0.03 and np.percentile(error, 95) <= 0.1

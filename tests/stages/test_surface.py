@@ -112,7 +112,7 @@ def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     write_glb(tmp_path / "moved.glb", mesh, ["red"], {"red": Reflectance([0.2, 0.1, 0.1], [0.0] * 3, 0.5)})
     data = (tmp_path / "moved.glb").read_bytes()
     tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    assert "COLOR_0" in tree["meshes"][0]["primitives"][0]["attributes"]
+    assert "TEXCOORD_0" in tree["meshes"][0]["primitives"][0]["attributes"]
     base = tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
     np.testing.assert_allclose(base[:3], np.exp(0.05) * np.array([0.2, 0.1, 0.1]), rtol=1e-6)
     other = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
