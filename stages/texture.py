@@ -6,10 +6,10 @@ Every pixel observes the factor of its surface point on the diffuse reflectance,
 Writes texture.json, and if a texture is kept, factors.parquet and photos/<photo>.exr: the factors at every pixel.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,13 +33,23 @@ from factorlib.results.materials import MaterialTable, read_materials, select_ma
 from factorlib.results.surface_table import DetailEvidence, read_surface
 from factorlib.results.texture_table import FACTORS, FILE, TextureEvidence, TextureTable, write_factors
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import observed_pixels, read_geometry
+from factorlib.urm.extract import Channels, observed_pixels, read_geometry
 
 FINEST, COARSEST = 0.004, 0.04  # range of the longest edge, in units of the mesh's extent
 EDGE_PIXELS = 2.0  # longest edge, in pixels of a typical photo
 CLUSTER_PIXELS = 16  # side of the blocks of pixels whose residuals are correlated
 DETAIL = ("detail.R", "detail.G", "detail.B")
-Factors = dict[tuple[str, str], Float[np.ndarray, "v 3"]]
+# Edge of the trial's meshes, in units of their extent, and its step between rows and columns of pixels.
+TRIAL_EDGE, TRIAL_STEP = 0.02, 2
+Key = tuple[str, str]  # names of a mesh and of a material
+Factors = dict[Key, Float[np.ndarray, "v 3"]]
+
+
+class Estimate(NamedTuple):
+    """Texture of one material of one mesh, None if it is not kept, and the evidence."""
+
+    factor: Float[np.ndarray, "v 3"] | None
+    evidence: TextureEvidence
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,7 +65,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Estimate the texture of every material on every mesh, and write those that are kept."""
     names = inputs.facts["dataset.materials"]
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
-    table = read_materials(inputs["solve"] / "materials.json")
     surface = read_surface(inputs.folders.get("surface"))
     read = MeshCache(inputs.mesh, names, CREASE_DEG, surface.displacements, surface.log_factors)
     meshes = visible_meshes(read, slices)
@@ -64,41 +73,131 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         return
     photos = read_aligned_photos(inputs, slices)
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    fine = {name: subdivided_mesh(mesh, longest_edge(name, mesh, photos, params.edge)) for name, mesh in meshes.items()}
+    total = 2 * len(solved_photos(lights)) + 2 * len(meshes) + len(photos)
     steps = count()
-    fitted = sorted(solved_photos(lights))
-    total = len(fitted) + len(meshes) + len(photos)
-    observed: dict[tuple[str, str], list[TextureSamples]] = {}
 
-    def observe(name: str) -> list[tuple[tuple[str, str], TextureSamples]]:
-        """Return what a photo observes."""
-        samples = list(observe_photo(inputs, name, lights[name], (photos[name], fine), table))
-        progress(next(steps), total, f"{name}: light and highlights")
-        return samples
+    def report(activity: str) -> None:
+        """Report that a piece of work begins or ends."""
+        progress(next(steps), total, activity)
 
-    for pixels in inputs.map(observe, fitted):
-        for key, samples in pixels:
-            observed.setdefault(key, []).append(samples)
-    factors: Factors = {}
-    evidence = []
-    for name, mesh in fine.items():
-        progress(next(steps), total, f"texture of {name}")
-        for key in sorted(key for key in observed if key[0] == name):
-            values, decision, stiffness = select_texture(observed[key], mesh.laplacian())
-            by = DetailEvidence.from_decision(decision, stiffness)
-            evidence.append(TextureEvidence(*key, values is not None, len(observed[key]), by))
-            if values is not None:
-                factors[key] = values.astype(np.float32)
-    longest = {name: longest_edge(name, meshes[name], photos, params.edge) for name, _ in factors}
-    write_json(out / FILE, TextureTable(longest, evidence))
+    solved = SolvedPhotos(inputs, photos, lights, read_materials(inputs["solve"] / "materials.json"), report)
+    # a coarse trial, then the promising ones at the photos' resolution
+    coarse = {name: subdivided_mesh(mesh, TRIAL_EDGE) for name, mesh in meshes.items()}
+    estimates = solved.estimate(coarse, None, TRIAL_STEP)
+    promising = {key for key, trial in estimates.items() if (trial.evidence.by.margin or 0.0) > 0}
+    longest = {
+        name: longest_edge(name, meshes[name], photos, params.edge) for name in sorted({n for n, _ in promising})
+    }
+    fine = {name: subdivided_mesh(meshes[name], edge) for name, edge in longest.items()}
+    if promising:
+        estimates |= solved.estimate(fine, promising, 1)
+    kept = {key: estimates[key].factor for key in sorted(promising)}
+    factors = {key: factor.astype(np.float32) for key, factor in kept.items() if factor is not None}
+    longest = {name: longest[name] for name, _ in factors}
+    write_json(out / FILE, TextureTable(longest, [estimates[key].evidence for key in sorted(estimates)]))
     if factors:
         write_factors(out / FACTORS, factors)
         (out / "photos").mkdir()
         for name, photo in photos.items():
-            progress(next(steps), total, f"{name}: texture")
-            geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
-            write_exr(out / "photos" / f"{name}.exr", detail_channels(photo, geometry, fine, factors, names))
+            report(f"{name}: texture")
+            write_exr(
+                out / "photos" / f"{name}.exr", detail_channels(photo, solved.geometry(name), fine, factors, names)
+            )
     progress(total, total)
+
+
+class SolvedPhotos(msgspec.Struct, frozen=True):
+    """Photos with what `align` and `solve` estimated.
+
+    Attributes:
+        inputs: Inputs of the stage.
+        photos: Photos as `align` left them.
+        lights: Illumination of each photo.
+        table: Solved materials.
+        report: Called with the current activity.
+    """
+
+    inputs: Inputs
+    photos: dict[str, AlignedPhoto]
+    lights: dict[str, LightSlice]
+    table: MaterialTable
+    report: Callable[[str], None]
+
+    def geometry(self, name: str) -> Channels:
+        """Return the maps of a photo, with the normals and the detail of `surface`."""
+        return read_geometry(self.inputs["align"], self.inputs.folders.get("surface"), name)
+
+    def estimate(self, fine: dict[str, SubdividedMesh], keys: set[Key] | None, step: int) -> dict[Key, Estimate]:
+        """Return the texture of each mesh and material, and the evidence.
+
+        Args:
+            fine: Subdivided meshes.
+            keys: Meshes and materials; None for all.
+            step: Step between the used rows and columns of the photos.
+        """
+
+        def observe(name: str) -> list[tuple[Key, TextureSamples]]:
+            """Return what a photo observes."""
+            samples = list(self.observe(name, fine, keys, step))
+            self.report(f"{name}: light and highlights")
+            return samples
+
+        observed: dict[Key, list[TextureSamples]] = {}
+        for samples_by_key in self.inputs.map(observe, sorted(solved_photos(self.lights))):
+            for key, samples in samples_by_key:
+                observed.setdefault(key, []).append(samples)
+        estimates = {}
+        for name, mesh in fine.items():
+            self.report(f"texture of {name}")
+            laplacian = mesh.laplacian()
+            for key in sorted(key for key in observed if key[0] == name):
+                factor, decision, stiffness = select_texture(observed[key], laplacian)
+                by = DetailEvidence.from_decision(decision, stiffness)
+                estimates[key] = Estimate(factor, TextureEvidence(*key, factor is not None, len(observed[key]), by))
+        return estimates
+
+    def observe(
+        self, name: str, fine: dict[str, SubdividedMesh], keys: set[Key] | None, step: int
+    ) -> Iterator[tuple[Key, TextureSamples]]:
+        """Yield what the pixels of a photo observe of each mesh and material; arguments as in `estimate`."""
+        names = self.inputs.facts["dataset.materials"]
+        photo = read_exr(self.inputs["masks"] / f"{name}.exr")
+        geometry = self.geometry(name)
+        clipped = np.any([photo[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
+        selected = observed_pixels(photo, geometry) & ~clipped & (np.indices(clipped.shape) % step == 0).all(0)
+        if keys is not None:
+            selected &= np.isin(np.rint(photo["label"]), [1 + names.index(material) for _, material in keys])
+        y, x = np.nonzero(selected)
+        radiance = np.stack([photo[c][y, x] for c in "RGB"], axis=-1).astype(float)
+        if tone := self.table.model.tone.get(name):
+            radiance = invert_tone(radiance, tone.exponent, tone.pivot)
+        label = np.where(selected, np.rint(photo["label"]), 0).astype(int)
+        parts = self.parts(name, {**photo, "label": label}, geometry)
+        cosine = sum(geometry[f"normal.{a}"] * geometry[f"view.{a}"] for a in "xyz").clip(0, 1)[y, x]
+        cluster = (y // CLUSTER_PIXELS) * label.shape[1] + x // CLUSTER_PIXELS
+        for mesh, rows, operator in attach_to_meshes(self.photos[name], np.column_stack([x, y]), fine):
+            of_rows = label[y[rows], x[rows]]
+            for number in np.unique(of_rows).tolist():
+                key = mesh, names[number - 1]
+                if keys is None or key in keys:
+                    places = np.flatnonzero(of_rows == number)
+                    pixels = rows[places]
+                    diffuse, specular = (part[y[pixels], x[pixels]] for part in parts)
+                    observed = radiance[pixels], diffuse, specular, cosine[pixels]
+                    yield key, observe_texture(*observed, (operator[places], cluster[pixels]))
+
+    def parts(self, name: str, photo: Channels, geometry: Channels) -> Float[np.ndarray, "2 h w 3"]:
+        """Return the diffuse radiance of a photo without detail, and the specular radiance."""
+        inputs = self.inputs
+        materials = select_materials(self.table, inputs.facts["dataset.materials"], inputs["solve"] / "materials.json")
+        reflector = Reflector(
+            reflection_operator("network", weights=inputs["train"]),
+            read_photo_light(inputs["solve"], name, self.lights[name]),
+            self.table.model.curvature(self.lights[name].illumination),
+        )
+        around = read_surroundings(inputs.folders, name, self.table.model)
+        bare = {channel: values for channel, values in geometry.items() if channel not in DETAIL}
+        return resynthesise_parts(reflector, materials, photo, bare, surroundings=around)
 
 
 def longest_edge(name: str, mesh: Mesh, photos: dict[str, AlignedPhoto], pixels: float) -> float:
@@ -112,44 +211,6 @@ def longest_edge(name: str, mesh: Mesh, photos: dict[str, AlignedPhoto], pixels:
                 scale = float(np.mean(photo.poses.objects[entry.name].scale))
                 sizes.append(float(np.median(depth)) / photo.poses.camera.focal_px / (scale * extent))
     return float(np.clip(pixels * np.median(sizes), FINEST, COARSEST)) if sizes else COARSEST
-
-
-def observe_photo(
-    inputs: Inputs,
-    name: str,
-    light: LightSlice,
-    surface: tuple[AlignedPhoto, dict[str, SubdividedMesh]],
-    table: MaterialTable,
-) -> Iterator[tuple[tuple[str, str], TextureSamples]]:
-    """Yield what the pixels of a photo observe of each mesh and material."""
-    names = inputs.facts["dataset.materials"]
-    aligned, fine = surface
-    photo = read_exr(inputs["masks"] / f"{name}.exr")
-    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
-    y, x = np.nonzero(observed_pixels(photo, geometry) & ~np.any([photo[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0))
-    radiance = np.stack([photo[c][y, x] for c in "RGB"], axis=-1).astype(float)
-    if tone := table.model.tone.get(name):
-        radiance = invert_tone(radiance, tone.exponent, tone.pivot)
-    materials = select_materials(table, names, inputs["solve"] / "materials.json")
-    reflector = Reflector(
-        reflection_operator("network", weights=inputs["train"]),
-        read_photo_light(inputs["solve"], name, light),
-        table.model.curvature(light.illumination),
-    )
-    around = read_surroundings(inputs.folders, name, table.model)
-    bare = {channel: values for channel, values in geometry.items() if channel not in DETAIL}
-    diffuse, specular = (
-        part[y, x] for part in resynthesise_parts(reflector, materials, photo, bare, surroundings=around)
-    )
-    cosine = sum(geometry[f"normal.{a}"][y, x] * geometry[f"view.{a}"][y, x] for a in "xyz").clip(0, 1)
-    label = np.rint(photo["label"][y, x]).astype(int)
-    cluster = (y // CLUSTER_PIXELS) * geometry["depth"].shape[1] + x // CLUSTER_PIXELS
-    for mesh, rows, operator in attach_to_meshes(aligned, np.column_stack([x, y]), fine):
-        for material in np.unique(label[rows]).tolist():
-            one = np.flatnonzero(label[rows] == material)
-            pixels = rows[one]
-            observed = radiance[pixels], diffuse[pixels], specular[pixels], cosine[pixels]
-            yield (mesh, names[material - 1]), observe_texture(*observed, (operator[one], cluster[pixels]))
 
 
 def attach_to_meshes(
@@ -169,11 +230,11 @@ def attach_to_meshes(
 
 def detail_channels(
     photo: AlignedPhoto,
-    geometry: dict[str, Float[np.ndarray, "h w"]],
+    geometry: Channels,
     fine: dict[str, SubdividedMesh],
     factors: Factors,
     names: list[str],
-) -> dict[str, Float[np.ndarray, "h w"]]:
+) -> Channels:
     """Return detail.R, .G, .B of a photo: the texture, elsewhere the detail of `surface`; 0 without a mesh."""
     y, x = np.nonzero(photo.geometry["object"] > 0.5)
     label = np.rint(photo.geometry["label"][y, x]).astype(int)

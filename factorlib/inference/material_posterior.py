@@ -64,11 +64,7 @@ def material_posterior(
     if not free[3:].any():
         return MaterialPosterior(fitted, deviation, np.zeros(7))
     mixture = Mixture(classes_of(name))
-    # S with limited deviations, θ₀ and S + M
-    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(np.sqrt(np.diag(covariance)), LEAST_DEVIATION))
-    limited = covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)
-    slope_at_fit = np.where(free, np.append(np.zeros(3), mixture.evaluate(fitted[3:])[1]), 0.0)
-    center = fitted + np.where(free, limited @ slope_at_fit, 0.0)
+    limited, center = without_prior(fitted, covariance, free, mixture)
     limited += np.diag(model_error**2)
     precision = np.linalg.inv(limited[np.ix_(free, free)])
     bounds = [(low, max(high, value)) for (low, high), value in zip(BOUNDS, fitted, strict=True)]
@@ -96,3 +92,13 @@ def material_posterior(
     # no prior bears on k_d, whose deviation is therefore not limited
     posterior_deviation = np.where(np.arange(7) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))
     return MaterialPosterior(result, posterior_deviation, share)
+
+
+def without_prior(
+    fitted: Float[np.ndarray, "7"], covariance: Float[np.ndarray, "7 7"], free: Bool[np.ndarray, "7"], mixture: Mixture
+) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "7"]]:
+    """Return S with limited deviations, and θ₀ of (1)."""
+    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(np.sqrt(np.diag(covariance)), LEAST_DEVIATION))
+    limited = covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)
+    slope = np.where(free, np.append(np.zeros(3), mixture.evaluate(fitted[3:])[1]), 0.0)
+    return limited, fitted + np.where(free, limited @ slope, 0.0)

@@ -105,7 +105,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         In two dimensions this sum does not depend on the resolution of the mesh.
         """
         edges = self.edges
-        number = np.arange(len(self.edges))
+        number = np.arange(len(edges))
         signs = np.concatenate([np.ones(len(edges)), -np.ones(len(edges))])
         difference = csr_array((signs, (np.tile(number, 2), edges.T.reshape(-1))), (len(edges), self.nodes))
         return csr_array(difference.T @ difference)
