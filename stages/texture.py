@@ -85,9 +85,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     coarse = {name: subdivided_mesh(mesh, TRIAL_EDGE) for name, mesh in meshes.items()}
     estimates = solved.estimate(coarse, None, TRIAL_STEP)
     promising = {key for key, trial in estimates.items() if (trial.evidence.by.margin or 0.0) > 0}
-    longest = {
-        name: longest_edge(name, meshes[name], photos, params.edge) for name in sorted({n for n, _ in promising})
-    }
+    visible = [name for name in meshes if any(mesh == name for mesh, _ in promising)]
+    longest = {name: longest_edge(name, meshes[name], photos, params.edge) for name in visible}
     fine = {name: subdivided_mesh(meshes[name], edge) for name, edge in longest.items()}
     if promising:
         estimates |= solved.estimate(fine, promising, 1)
@@ -173,7 +172,7 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
             radiance = invert_tone(radiance, tone.exponent, tone.pivot)
         label = np.where(selected, np.rint(photo["label"]), 0).astype(int)
         parts = self.parts(name, {**photo, "label": label}, geometry)
-        cosine = sum(geometry[f"normal.{a}"] * geometry[f"view.{a}"] for a in "xyz").clip(0, 1)[y, x]
+        cosine = np.sum([geometry[f"normal.{a}"] * geometry[f"view.{a}"] for a in "xyz"], axis=0).clip(0, 1)[y, x]
         cluster = (y // CLUSTER_PIXELS) * label.shape[1] + x // CLUSTER_PIXELS
         for mesh, rows, operator in attach_to_meshes(self.photos[name], np.column_stack([x, y]), fine):
             of_rows = label[y[rows], x[rows]]

@@ -67,8 +67,7 @@ def material_posterior(
     limited, center = without_prior(fitted, covariance, free, mixture)
     limited += np.diag(model_error**2)
     precision = np.linalg.inv(limited[np.ix_(free, free)])
-    bounds = [(low, max(high, value)) for (low, high), value in zip(BOUNDS, fitted, strict=True)]
-    free_bounds = [bounds[k] for k in np.flatnonzero(free)]
+    bounds = [(low, max(high, fitted[k])) for k, (low, high) in enumerate(BOUNDS) if free[k]]
 
     def objective(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
         """Return (1) and its gradient by the free unknowns."""
@@ -81,7 +80,7 @@ def material_posterior(
 
     # (1) has several minima: one start is the fit, the others have the means of the classes
     starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean)]
-    minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=free_bounds) for start in starts]
+    minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x
     by_prior = np.zeros((7, 7))
