@@ -38,6 +38,10 @@ PULL = 1e-4  # ε of (2), which only fixes meshes that no pixel shows
 DARK = 0.2  # d, as a share of a photo's mean diffuse radiance
 LOSS = RobustLoss(0.15)  # ρ of (2)
 REWEIGHTINGS = 2  # solutions of (2) after the first one
+# Least relative gain of the loss over the flat colour's, and a loss added to both: that of paint too weak to see, 3 %.
+# Under two standard errors alone, plain shells of a painted set got textures of their wrong normals.
+LEAST_GAIN = 0.25
+INVISIBLE = 0.001
 LARGEST_RATIO = 20.0  # largest z
 LEAST_SHARED = 0.2  # least weight of other photos' pixels about a node that counts as seen by them
 CG_TOLERANCE = 1e-3
@@ -153,12 +157,19 @@ def select_texture(
         textures = [solve_texture(other, laplacian, stiffness, texture) for other, texture in pairs]
         losses = [samples[k].losses(samples[k].operator @ textures[k % folds], shared[k]) for k in predicted]
         evidence = compare_models(flat, Losses(losses, clusters), CLEARLY_FOR)
+        evidence = msgspec.structs.replace(evidence, accepted=evidence.accepted and is_visible(evidence))
         if best is not None and (evidence.held_out_loss_with or 0) >= (best[0].held_out_loss_with or 0):
             break
         best = evidence, stiffness
     assert best is not None
     texture = solve_texture(samples, laplacian, best[1]) if best[0].accepted else None
     return texture, best[0], best[1]
+
+
+def is_visible(evidence: Decision) -> bool:
+    """Return True if the loss of the flat colour is more than `LEAST_GAIN` larger, beyond invisible paint."""
+    without, with_texture = (evidence.held_out_loss_without or 0.0), (evidence.held_out_loss_with or 0.0)
+    return without + INVISIBLE > (1 + LEAST_GAIN) * (with_texture + INVISIBLE)
 
 
 def flat_colour(samples: Sequence[TextureSamples]) -> Float[np.ndarray, "1 3"]:

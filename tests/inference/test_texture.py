@@ -91,3 +91,9 @@ def test_grazing_and_dark_pixels_count_less():
     operator = csr_array(np.eye(3))
     weight = observe_texture(diffuse, diffuse, 0 * diffuse, np.array([1.0, 0.1, 1.0]), (operator, np.arange(3))).weight
     assert weight[1] == pytest.approx(0.1 * weight[0]) and weight[2] < 0.6 * weight[0]
+
+
+def test_paint_that_nobody_sees_is_not_kept():
+    samples = [pixels(PAINT**0.05, seed, noise=0.01) for seed in range(3)]
+    factor, evidence, _ = select_texture(samples, LAPLACIAN)
+    assert factor is None and evidence.margin > texture.CLEARLY_FOR
