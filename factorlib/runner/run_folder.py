@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 LOCK = "lock"  # in the folder of a run, which holds it
-TRIES, PAUSE = 20, 0.1  # attempts to delete a run's folder, and seconds between two
 ABANDONED = 86400.0  # seconds without a change after which a draft outside a run is of a killed process
 
 
@@ -31,15 +30,6 @@ def begin_run(store: Store) -> tuple[Path, BaseFileLock]:
     folder = store.tmp / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
     with _entrance(store):
         return folder, lock(folder / LOCK)
-
-
-def end_run(folder: Path) -> None:
-    """Delete a run's folder; a process that ends meanwhile may look at the lock in it once more."""
-    for _ in range(TRIES):
-        shutil.rmtree(folder, ignore_errors=True)
-        if not folder.exists():
-            return
-        time.sleep(PAUSE)
 
 
 @contextlib.contextmanager

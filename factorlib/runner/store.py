@@ -15,6 +15,7 @@ remembers the faults of a tree by sizes and times of its files, so that each is 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import os
 import shutil
@@ -243,12 +244,15 @@ def lock(path: Path, wait: bool = False) -> BaseFileLock:
 
 
 def is_locked(path: Path) -> bool:
-    """Return True if any process holds the lock; False if this user may not ask."""
+    """Return True if any process holds the lock; False if this user may not ask.
+
+    Nothing is created: the folder may be deleted meanwhile.
+    """
     try:
-        if path.exists():
-            lock(path).release()
+        with open(path, "r+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        return isinstance(error, TimeoutError)
+        return isinstance(error, BlockingIOError)
     return False
 
 
