@@ -7,7 +7,7 @@ and Wüthrich 1998) of the faces about its vertex. Third, only faces within the 
 count: an edge stays sharp, a curve stays smooth. Duplicate vertices are one vertex here, by position.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import msgspec
 import numpy as np
@@ -51,6 +51,15 @@ class Mesh(msgspec.Struct, frozen=True):
     def radius(self) -> float:
         """Largest distance of a used vertex from `centre`."""
         return float(np.linalg.norm(self.vertices[np.unique(self.faces)] - self.centre, axis=1).max())
+
+
+def without_paint(mesh: Mesh, labels: Iterable[int]) -> Mesh:
+    """Return the mesh without detail on the faces of some labels, which get another material."""
+    if mesh.detail is None:
+        return mesh
+    detail = mesh.detail.copy()
+    detail[np.unique(mesh.faces[np.isin(mesh.face_label, list(labels))])] = 1.0
+    return msgspec.structs.replace(mesh, detail=detail)
 
 
 def scale_mesh(mesh: Mesh, factors: Sequence[float]) -> Mesh:

@@ -21,6 +21,7 @@ from factorlib.images.exr import write_rgb_exr
 from factorlib.images.film import write_gif, write_mp4
 from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
+from factorlib.meshes.mesh import without_paint
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import AnyRecipe, is_light_file
 from factorlib.render.ground import on_floor
@@ -123,7 +124,12 @@ def write_resynthesis(
                 ", ".join(map(repr, sorted(replaced))),
                 ", ".join(sorted(present)),
             )
-        scene = msgspec.structs.replace(scene, materials={**scene.materials, **replaced})
+        objects = []
+        for each in scene.objects:
+            labels = [label for label in each.mesh.labels if each.materials[label - 1] in replaced]
+            objects.append(msgspec.structs.replace(each, mesh=without_paint(each.mesh, labels)))
+        materials = {**scene.materials, **replaced}
+        scene = msgspec.structs.replace(scene, objects=tuple(objects), materials=materials)
     traced = TracedPicture(traced_photo(scene, recipe.samples), results.tone(photo))
     _write_opaque(out / photo, traced.composite_over(results.photo(photo)))
 

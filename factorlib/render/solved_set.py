@@ -16,7 +16,7 @@ from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import apply_tone, invert_tone
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.mesh import Mesh, scale_mesh
+from factorlib.meshes.mesh import Mesh, scale_mesh, without_paint
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, ViewCamera, is_light_file, is_mesh_file, read_table
@@ -231,6 +231,9 @@ class SolvedSet:
                 materials = (material,) * len(materials)
             elif material is not None:
                 materials = tuple(material.get(each, each) for each in materials)
+            mesh = without_paint(
+                mesh, [label for label in mesh.labels if materials[label - 1] != self.names[label - 1]]
+            )
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
             raise InputError(
                 f"the mesh {name!r} has no height",

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.images.exr import read_exr, write_rgb_exr
+from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
+from factorlib.meshes.read_mesh import read_mesh
+from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.recipe import kinds
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
+from factorlib.results.texture_table import FACTORS, FILE, TextureTable, write_factors
 from factorlib.stage import Inputs, silent
 from stages import recipes
 from tests.export import made_export
@@ -69,7 +72,32 @@ def test_files_of_every_kind_and_the_same_bytes_again(grounded, tmp_path, recipe
     assert sorted(first) == sorted(files) and first == second
 
 
-@pytest.mark.parametrize("photo", made_export.MESHES)
+@pytest.fixture
+def painted(grounded, tmp_path):
+    """The same with a texture of a half on the red of the egg."""
+    egg = read_mesh(grounded.files["egg.obj"], made_export.NAMES, made_export.PARTS["egg"])
+    write_factors(tmp_path / FACTORS, {("egg", "red"): np.full((subdivided_mesh(egg, 0.04).nodes, 3), 0.5)})
+    write_json(tmp_path / FILE, TextureTable({"egg": 0.04}))
+    return Inputs({**grounded.folders, "texture": tmp_path}, grounded.facts, grounded.files)
+
+
+def test_paint_stays_with_its_material_and_another_material_has_none(painted, grounded, tmp_path):
+    results = SolvedSet(painted)
+    shares = {kind: results.mesh("egg", kind, "y")[0].detail for kind in (None, "unseen")}
+    assert 0.2 < (shares[None] == 0.5).mean() < 0.8 and (shares["unseen"] == 1).all()
+    side = {"photos": ["side"], "samples": 1}
+    recipe = kinds.TransferRecipe(materials={"red": "unseen"}, **side)
+    own = kinds.ResynthesisRecipe(**side)
+    changes = []
+    for number, one in enumerate((recipe, own)):
+        pictures = []
+        for name, inputs in (("painted", painted), ("plain", grounded)):
+            drawn(inputs, tmp_path / f"{name} {number}", one)
+            pictures.append(read_rgb_exr(tmp_path / f"{name} {number}" / "side.exr"))
+        changes.append(np.abs(pictures[0] - pictures[1]).mean() / pictures[1].mean())
+    assert changes[0] < 0.2 * changes[1], changes
+
+
 def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(inputs, photo):
     """Also where that is fixed to the world: the map of the light with the sun is brightest in the direction that the recipe says."""
     results, sun = SolvedSet(inputs), kinds.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
