@@ -48,6 +48,7 @@ from factorlib.meshes.read_mesh import CREASE_DEG
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, Reflectance, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
+from factorlib.results.texture_table import read_table
 from factorlib.stage import Inputs, Progress
 from factorlib.tracing.scene import mitsuba_map
 from factorlib.wholefile import write_bytes, write_text
@@ -81,7 +82,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         (out / folder).mkdir(parents=True)
     table, solved, exposures = _solution_in_gauge(inputs["solve"], slices)
     materials = reflectances(table)
-    write_json(out / "materials.json", table)
+    write_json(out / "materials.json", _with_textures(table, inputs.folders.get("texture")))
     write_json(out / "exposures.json", exposures)
     _write_tables(out, materials, solved)
     _write_dataset(out, inputs)
@@ -133,6 +134,19 @@ def _solution_in_gauge(
             )
         lights[name] = solved.get(name, no_lobes()).scale(1 / factor)
     return table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json")
+
+
+def _with_textures(table: MaterialTable, texture: Path | None) -> MaterialTable:
+    """Return the table with the meshes on which each material has a texture."""
+    meshes: dict[str, list[str]] = {}
+    for evidence in read_table(texture).textures:
+        if evidence.kept:
+            meshes.setdefault(evidence.material, []).append(evidence.mesh)
+    solved = {
+        name: msgspec.structs.replace(material, textures=meshes.get(name, msgspec.UNSET))
+        for name, material in table.materials.items()
+    }
+    return msgspec.structs.replace(table, materials=solved)
 
 
 def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mapping[str, Lobes]) -> None:

@@ -86,6 +86,7 @@ class SolvedMaterial(Reflectance, frozen=True):
         kind: class of the material, if the solver has classes
         given: parts that were known beforehand, with standard errors of 0
         prior_share: shares that come from the prior, if the solver has one
+        textures: meshes on which an albedo texture multiplies `diffuse`, in the materials that `export` writes
     """
 
     alpha: AtLeast0
@@ -93,6 +94,7 @@ class SolvedMaterial(Reflectance, frozen=True):
     kind: Kind | UnsetType = UNSET
     given: list[str] | UnsetType = UNSET
     prior_share: PriorShares | UnsetType = UNSET
+    textures: list[str] | UnsetType = UNSET
 
     @property
     def reflectance(self) -> Reflectance:
