@@ -33,7 +33,9 @@ READY = VENV / "ready"
 PYTHON = VENV / "bin" / "python"
 TORCH = "torch==2.13.0"
 TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linux require gigabytes of CUDA.
-LOADED = "torch, scipy.optimize, mitsuba, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, xatlas, factorlib.geometry.open3d"
+LOADED = (
+    "torch, scipy.optimize, mitsuba, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, xatlas, factorlib.geometry.open3d"
+)
 # extras installed without dependencies: .venv has what they need, and bpy would require an older NumPy
 ALONE = ("blender", "interchange")
 # system libraries of Open3D and, for renders that are three times faster, of Mitsuba; and their Debian packages
