@@ -38,10 +38,10 @@ PULL = 1e-4  # ε of (2), which only fixes meshes that no pixel shows
 DARK = 0.2  # d, as a share of a photo's mean diffuse radiance
 LOSS = RobustLoss(0.15)  # ρ of (2)
 REWEIGHTINGS = 2  # solutions of (2) after the first one
-# Least relative gain of the loss over the flat colour's, and a loss added to both: that of paint too weak to see, 3 %.
+# Least relative gain of the loss over the flat colour's, and a loss added to both: that of paint of 4.5 %.
 # Under two standard errors alone, plain shells of a painted set got textures of their wrong normals.
-LEAST_GAIN = 0.25
-INVISIBLE = 0.001
+LEAST_GAIN = 0.2
+INVISIBLE = 0.002
 LARGEST_RATIO = 20.0  # largest z
 LEAST_SHARED = 0.2  # least weight of other photos' pixels about a node that counts as seen by them
 CG_TOLERANCE = 1e-3
