@@ -112,7 +112,7 @@ class Reflector:
         return result
 
     def _tensor(self, values: np.ndarray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(values), dtype=self.operator.dtype)
+        return torch.as_tensor(np.require(values, requirements=["C", "W"]), dtype=self.operator.dtype)
 
     def _radiance(
         self,
