@@ -249,10 +249,15 @@ def is_locked(path: Path) -> bool:
     Nothing is created: the folder may be deleted meanwhile.
     """
     try:
-        with open(path, "r+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         return isinstance(error, BlockingIOError)
+    finally:
+        os.close(descriptor)
     return False
 
 

@@ -98,6 +98,7 @@ def test_paint_stays_with_its_material_and_another_material_has_none(painted, gr
     assert changes[0] < 0.2 * changes[1], changes
 
 
+@pytest.mark.parametrize("photo", made_export.MESHES)
 def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(inputs, photo):
     """Also where that is fixed to the world: the map of the light with the sun is brightest in the direction that the recipe says."""
     results, sun = SolvedSet(inputs), kinds.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
