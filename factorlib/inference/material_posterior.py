@@ -75,8 +75,7 @@ def material_posterior(
         full[free] = unknowns
         off = unknowns - center[free]
         energy, slope, _, _ = mixture.evaluate(full[3:])
-        gradient = np.append(np.zeros(3), slope)[free]
-        return float(off @ precision @ off) + energy, 2 * (precision @ off + gradient)
+        return float(off @ precision @ off) + energy, 2 * (precision @ off + np.append(np.zeros(3), slope)[free])
 
     # (1) has several minima: one start is the fit, the others have the means of the classes
     starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean)]
