@@ -10,8 +10,9 @@ factor at node v, and b are barycentric coordinates.  So z_i = (y_i − S_i)/(k_
     Σ_i w_i ρ(z_i − t_i) + a Σ_edges |f_v − f_w|² + ε Σ_v |f_v − 1|²                                                 (2)
 
 with ρ the pseudo-Huber loss, by reweighted least squares.  Errors of D are relative to it, and those of y are not: w =
-cosine · x²/(x² + d²), x the mean of k_d D over channels and d the share `DARK` of its mean in the photo.  Nodes that no
-pixel shows continue the ones around them.
+cosine · x²/(x² + d²), x the mean of k_d D over channels and d the share `DARK` of the mean of k_d D + S over the
+material's pixels in the photo.  A metal thus observes no paint.  Nodes that no pixel shows continue the ones around
+them.
 
 Evidence    Each photo is predicted by the texture of others, a fold of photos at a time, where these see its surface.
             The stiffness a with the least loss is used.  The texture is kept if it predicts better than the best flat
@@ -35,7 +36,7 @@ from factorlib.results.materials import Decision
 
 STIFFNESSES = (3.0, 1.0, 0.3, 0.1, 0.03)  # a of (2), from stiff to soft
 PULL = 1e-4  # ε of (2), which only fixes meshes that no pixel shows
-DARK = 0.2  # d, as a share of a photo's mean diffuse radiance
+DARK = 0.2  # d, as a share of the material's mean radiance in a photo
 LOSS = RobustLoss(0.15)  # ρ of (2)
 REWEIGHTINGS = 2  # solutions of (2) after the first one
 # Least relative gain of the loss over the flat colour's, and a loss added to both: that of paint of 4.5 %.
@@ -86,7 +87,7 @@ def observe_texture(
         positions: b of (1), and the cluster of each pixel.
     """
     x = diffuse.mean(1)
-    dark = DARK * max(float(x.mean()), 1e-12) if len(x) else 1.0
+    dark = DARK * max(float((diffuse + specular).mean()), 1e-12) if len(x) else 1.0
     weight = cosine * x**2 / (x**2 + dark**2)
     ratio = (radiance - specular) / np.maximum(diffuse, 1e-3 * dark)
     return TextureSamples(positions[0], ratio.clip(0, LARGEST_RATIO), weight, positions[1])

@@ -49,11 +49,6 @@ class TextureTable(msgspec.Struct, frozen=True):
     longest: dict[str, float] = {}
     textures: list[TextureEvidence] = []
 
-    @property
-    def materials(self) -> set[str]:
-        """Names of the materials with a texture."""
-        return {texture.material for texture in self.textures if texture.kept}
-
 
 Factors = Mapping[tuple[str, str], Float[np.ndarray, "v 3"]]  # by mesh and material
 

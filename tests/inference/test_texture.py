@@ -93,6 +93,12 @@ def test_grazing_and_dark_pixels_count_less():
     assert weight[1] == pytest.approx(0.1 * weight[0]) and weight[2] < 0.6 * weight[0]
 
 
+def test_a_metal_observes_no_paint():
+    black, shine = np.full((3, 3), 1e-5), np.full((3, 3), 0.3)
+    samples = observe_texture(2 * shine, black, shine, np.ones(3), (csr_array(np.eye(3)), np.arange(3)))
+    assert (samples.weight < 1e-6).all()
+
+
 def test_paint_that_nobody_sees_is_not_kept():
     samples = [pixels(PAINT**0.05, seed, noise=0.01) for seed in range(3)]
     factor, evidence, _ = select_texture(samples, LAPLACIAN)
