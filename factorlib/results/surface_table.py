@@ -19,17 +19,20 @@ class DetailEvidence(msgspec.Struct, frozen=True):
         held_out_loss_without: loss of their held-out observations without it
         margin: difference of the logarithms, in standard errors
         stiffness: stiffness of the refinement, the best of the values that were tried
+        log_bayes_factor: logarithm of the Bayes factor of these photos, where it decides
     """
 
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
     margin: float | None = None
     stiffness: float | None = None
+    log_bayes_factor: float | None = None
 
     @classmethod
     def from_decision(cls, evidence: Any, stiffness: float | None) -> "DetailEvidence":
         """Convert the solver's decision and the chosen stiffness."""
-        return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
+        losses = evidence.held_out_loss_with, evidence.held_out_loss_without
+        return cls(*losses, evidence.margin, stiffness, evidence.log_bayes_factor)
 
 
 class SurfaceTable(msgspec.Struct, frozen=True):
