@@ -84,6 +84,7 @@ FORMS = {
     "16 bit": lambda at: save(at / "a.png", LABEL.astype(np.uint16)),
     "one each, 255": lambda at: {"wood": save(at / "w.png", WOOD * np.uint8(255)), "red": save(at / "r.png", RED * np.uint8(255))},
     "one each, 1": lambda at: {"red": save(at / "r.png", RED * np.uint8(1)), "wood": save(at / "w.png", WOOD * np.uint8(1))},
+    "one each, 16 bit": lambda at: {"red": save(at / "r.png", RED * np.uint16(65535)), "wood": save(at / "w.png", WOOD * np.uint16(50000))},
     "one each, 1 bit": lambda at: {"red": save(at / "r.png", RED), "wood": save(at / "w.png", WOOD)},
     "polygons": lambda at: coco(at, [(12, [box(5, 10, 15, 18), box(15, 10, 25, 18)]), (10, [box(3, 2, 12, 9)])]),
     "RLE": lambda at: coco(at, [(10, rle(counts_of(RED))), (12, rle(compressed(WOOD)))]),
