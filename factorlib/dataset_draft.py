@@ -259,7 +259,9 @@ def _name_outlines(masks: Masks, photos: Iterable[str], missing: list[str]) -> N
         mask = masks.by_photo[photo]
         if len(masks.materials) == 1:
             masks.by_photo[photo] = {masks.materials[0]: str(mask)}
-            missing.append(f"photo {photo}: {mask} has no labels: its brighter half is taken for {masks.materials[0]}")
+            missing.append(
+                f"photo {photo}: {mask} has no labels: cut at half, it is the silhouette of {masks.materials[0]}"
+            )
         else:
             cure = f"the mask of one material is called {photo}_<material>.png"
             missing.append(f"photo {photo}: {mask} has no label, for {LEFT_OUT} means left out; {cure}")

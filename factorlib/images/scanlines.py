@@ -128,7 +128,7 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
         profile=spec.get_string_attribute("ICCProfile:profile_description"),
         white=white,
         encoding="linear" if white is None else "srgb",
-        rows=rows if white else _in_rec709(_in_display_window(rows, spec), _primaries(spec, path)),
+        rows=rows if white else _in_rec709(_in_display_window(rows, spec), spec, path),
     )
 
 
@@ -153,16 +153,15 @@ def _in_display_window(rows: Rows, spec: oiio.ImageSpec) -> Rows:
     return displayed
 
 
-def _primaries(spec: oiio.ImageSpec, path: str | Path) -> Shaped[np.ndarray, "4 2"]:
-    """Return the chromaticities of red, green, blue and white by EXR's attribute or Radiance's line, else Rec. 709."""
+def _in_rec709(rows: Rows, spec: oiio.ImageSpec, path: str | Path) -> Rows:
+    """Return the reader of rows in linear Rec. 709; colours beyond it have negative values.
+
+    Primaries are EXR's attribute `chromaticities`, Radiance's line PRIMARIES, or else Rec. 709's.
+    """
     with Path(path).open("rb") as stream:
         line = re.match(rb"#\?[\S\s]*?\nPRIMARIES=([^\n]*)\n", stream.read(HEADER))
     given = spec.getattribute("chromaticities") or (line[1].split() if line else REC709)
-    return np.array(given, float).reshape(4, 2)
-
-
-def _in_rec709(rows: Rows, primaries: Shaped[np.ndarray, "4 2"]) -> Rows:
-    """Return the reader of rows in linear Rec. 709; colours beyond it have negative values."""
+    primaries = np.array(given, float).reshape(4, 2)
     if np.abs(primaries - REC709).max() < SAME_CHROMATICITY:
         return rows
     matrix = (np.linalg.inv(_xyz_from_rgb(REC709)) @ _xyz_from_rgb(primaries)).astype(np.float32)

@@ -66,8 +66,7 @@ def read_labels(
         inside = read_coco(mask_file, image, materials, size, key)
         labels = _merged(inside, materials, dict.fromkeys(inside, (mask_file, key)), edge=DRAWN_EDGE)
     else:
-        levels = len(PurePosixPath(masks).parts)
-        folder = mask_file.parents[levels - 1]
+        folder = mask_file.parents[len(PurePosixPath(masks).parts) - 1]
         labelmap = labelmap_beside(masks, folder)
         values = read_colours(mask_file, folder / labelmap, materials, size, key) if labelmap else None
         values = read_values(mask_file, key, size) if values is None else values

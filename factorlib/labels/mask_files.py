@@ -340,11 +340,12 @@ def _check_stated_size(coco: Coco, entry: CocoImage, size: tuple[int, int], path
     """Check the size that a file states; that of a photo on its side may be the stored one, which an outline leaves."""
     height = entry.height or size[0]
     width = entry.width or size[1]
-    shapes = [annotation.segmentation for annotation in coco.annotations if annotation.image_id == entry.id]
-    outlines = [outline for text in shapes if bytes(text)[:1] == b"[" for outline in msgspec.json.decode(text)]
-    beyond = [max(outline[::2], default=0) > width or max(outline[1::2], default=0) > height for outline in outlines]
-    if (height, width) != size[::-1] or not any(beyond):
-        check_size((height, width), size, path, key)
+    if (height, width) == size[::-1] != size:
+        shapes = [bytes(shape.segmentation) for shape in coco.annotations if shape.image_id == entry.id]
+        outlines = [outline for text in shapes if text[:1] == b"[" for outline in msgspec.json.decode(text)]
+        if any(max(each[::2], default=0) > width or max(each[1::2], default=0) > height for each in outlines):
+            return
+    check_size((height, width), size, path, key)
 
 
 def _union(

@@ -2,15 +2,9 @@
 
 PLY is read here, because its lists may differ in length, which trimesh refuses. A row of a text file is a line; numbers
 behind those of the header, which MeshLab writes, are ignored. Nothing is allocated that the file has no room for.
-
-trimesh reads STL. It reads a truncated text file as a smaller mesh, so the number of corners is compared with the
-file's. It is imported on first use, which takes a third of a second.
 """
 
-import io
 import re
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +44,9 @@ CORNERS = ("vertex_indices", "vertex_index")
 Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, and of the length before a list of them
 Elements = dict[str, tuple[int, Properties]]  # number of rows and their properties
 Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # numbers of all rows, concatenated, and the count of each row
-VERTEX = re.compile(rb"^[ \t]*vertex\b", re.MULTILINE | re.IGNORECASE)
+STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE | re.IGNORECASE)
+END_FACET = re.compile(rb"^[ \t]*endfacet\b", re.MULTILINE | re.IGNORECASE)
 COUNTS = re.compile(r"(?:(?:ST)?C?N?OFF)?\s*([0-9]+)\s+([0-9]+)[^\n]*")  # OFF itself is optional
 CURE = "the file may be incomplete, or of another format than its suffix: copy or export it again"
 
@@ -279,24 +275,17 @@ def read_stl(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     Raises:
         InputError: If the file is malformed or too large.
     """
-    from trimesh.exchange.stl import load_stl
-
     binary_size = 84 + 50 * int.from_bytes(content[80:84], "little")
-    is_binary = len(content) == binary_size
-    mesh = _loaded(load_stl, content if is_binary else content.decode("ascii", "replace").encode())
-    solids = list(mesh["geometry"].values()) if "geometry" in mesh else [mesh]
-    corners = np.concatenate([np.empty((0, 3)), *(floats(solid["vertices"]) for solid in solids)])
+    if len(content) == binary_size:
+        corners = np.frombuffer(content, STL_ROW, offset=84)["corners"].reshape(-1, 3)
+    else:
+        corners = parse_numbers(b" ".join(VERTEX.findall(content))).reshape(-1, 3)
+        facets = len(END_FACET.findall(content))
+        if not 0 < len(corners) == 3 * facets:
+            fault = f"is neither a whole text STL ({len(corners)} corners of {facets} facets) "
+            fault += f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
+            raise InputError(fault, file=path, cure=CURE)
     limits.check(len(corners), len(corners) // 3, path)
-    expected = len(VERTEX.findall(content))
-    if not is_binary and not 0 < len(corners) == expected:
-        raise InputError(
-            (
-                f"is neither a whole text STL ({len(corners)} of {expected} corners can be read) "
-                f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
-            ),
-            file=path,
-            cure=CURE,
-        )
     return single_part_soup(corners, np.arange(len(corners)), path.stem)
 
 
@@ -322,13 +311,3 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     columns = _text_columns(rows, {"vertex": (vertices, dict.fromkeys("xyz", ("f8", None))), "face": (faces, polygon)})
     points = np.stack([columns["vertex"][axis][0] for axis in "xyz"], axis=1)
     return _polygon_soup(points, *columns["face"]["corners"], path, limits)
-
-
-def _loaded(load: Callable[[io.BytesIO], dict], content: bytes) -> dict:
-    """Call a reader of trimesh; ValueError for text that is not a number, of which NumPy only warns."""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            return load(io.BytesIO(content))
-        except DeprecationWarning:
-            raise ValueError("a word in it is not a number") from None

@@ -74,7 +74,9 @@ def test_a_mask_without_labels_is_the_silhouette_of_one_material_and_that_is_sai
     if kind != "photo":
         Image.fromarray(pixels).convert("RGB").save(folder / "photos" / "kitchen.jpg")
     missing, spec = made(folder, masks=None if kind == "photo" else "masks")
-    assert spec["materials"] == ["label_1"] and all("brighter half is taken for label_1" in line for line in missing)
+    assert spec["materials"] == ["label_1"] and all(
+        "cut at half, it is the silhouette of label_1" in line for line in missing
+    )
     dataset = read_dataset(folder / "data" / "mine")
     inside = read_labels(dataset.photo("kitchen").masks, lambda name: dataset.folder / name, ["label_1"], (8, 10), "")
     assert np.array_equal(inside.label, grey > 127)
