@@ -268,7 +268,8 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
         _draw_sheet(project, folder)
     except InputError as fault:
         print(f"  no contact sheet: {fault}")
-    first = "" if masks else f"name your materials in it, then {project.command('label', dataset)}, then "
+    drawn = f"name your materials in it, then {project.command('label', dataset)}, then "
+    first = drawn if any("make label" in line for line in missing) else ""
     print(f"next: {first}{project.command('validate', dataset)}")
     return 0
 
