@@ -59,7 +59,7 @@ def visual_hull(
             "photos overlap, or use lathe or primitive"
         )
         raise InputError(fault, cure=cure)
-    middle, radius = _bounding_ball(outlines)
+    middle, radius = bounding_ball(outlines)
     low = middle - radius
     high = middle + radius
     # sample f on a coarse grid to locate the body, then on a fine one about it
@@ -130,7 +130,7 @@ def hull_overlap(outlines: Sequence[Outline]) -> float:
         return 0.0
 
 
-def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
+def bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the point nearest to the rays through the outlines' centres, and a radius about it.
 
     The radius is the least extent of an outline, projected back to that point.
