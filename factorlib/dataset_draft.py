@@ -36,7 +36,7 @@ from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.labels.label_image import read_labels
 from factorlib.labels.mask_files import Category, read_inside, read_values
 from factorlib.meshes.read_mesh import read_mesh, read_parts
-from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, PhotoFolder, read_photo_folder
+from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder
 from factorlib.reading import read_bytes, reading
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
@@ -90,14 +90,14 @@ class Masks(msgspec.Struct):
     silhouettes: dict[str, dict[str, str]] = {}
 
 
-def photos_in(photos: Path) -> tuple[dict[str, Path], PhotoFolder]:
-    """Return the photos of a folder by name, and what else lies in it."""
-    contents = read_photo_folder(photos, _files(photos, SUFFIXES, "PHOTOS", deep=True))
-    images = _by_name(contents.images, "PHOTOS", photos)
+def photos_in(photos: Path) -> tuple[dict[str, Path], dict[str, Path], Cameras | None]:
+    """Return the photos of a folder by name, masks by the stems of their photos' names, and cameras."""
+    files, masks, cameras = read_photo_folder(photos, _files(photos, SUFFIXES, "PHOTOS", deep=True))
+    images = _by_name(files, "PHOTOS", photos)
     if not images:
         fault = f"the folder has no photos ({', '.join(IMAGES[:6])}, …)"
         raise InputError(fault, file=photos, key="PHOTOS", cure="name the folder of the photos")
-    return images, contents
+    return images, masks, cameras
 
 
 def new_dataset(
@@ -117,9 +117,8 @@ def new_dataset(
             for a link, an unprintable file name, and too many pixels.
     """
     above = check_target(target)
-    images, contents = photos_in(photos)
-    cameras = cameras or contents.cameras
-    mask_files = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks else sorted(contents.masks.values())
+    images, photo_masks, source = photos_in(photos)
+    mask_files = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks else sorted(photo_masks.values())
     if masks is None and mask_files:
         masks = Path(os.path.commonpath([path.parent for path in mask_files]))
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes else []  # including .mtl and buffers
@@ -127,14 +126,14 @@ def new_dataset(
     labelled = _masks(masks, mask_files, list(images), missing) if masks else Masks()
     entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
-    missing += _missing_masks(list(images), labelled) if masks is not None else [NO_MASKS]
+    missing += _missing_masks(list(images), labelled) if masks else [NO_MASKS]
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
-        missing += [] if cameras else [NO_MESH]
-        cameras = cameras or Cameras({"sfm": True})
+        missing += [] if cameras or source else [NO_MESH]
+        cameras = cameras or source or Cameras({"sfm": True})
         entries = {HULL: _shape(spec["materials"], cameras)}
         visible = {photo: [HULL] for photo in images}
-    cameras = cameras or Cameras()
+    cameras = cameras or source or Cameras()
     spec |= {"cameras": cameras.source} if cameras.source else {}
     missing += [NO_MATERIAL] * (not labelled.materials and masks is not None)
     missing += [RESERVED.format(photo) for photo in images if photo in RESERVED_PHOTOS]
@@ -143,7 +142,7 @@ def new_dataset(
     spec["photos"] = [photo | cameras.by_photo.get(photo["name"], {}) for photo in spec["photos"]]
     sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
     sources |= {"cameras": (cameras.folder, cameras.files)}
-    places = {name: (folder, files) for name, (folder, files) in sources.items() if folder is not None}
+    places = {name: (folder, files) for name, (folder, files) in sources.items() if folder}
     _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     _write(target, spec, places, above)
     return missing

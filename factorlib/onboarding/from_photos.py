@@ -5,9 +5,7 @@ of structure from motion.  With cameras the shape is the visual hull of the mask
 """
 
 import json
-import logging
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,9 +15,8 @@ import numpy as np
 
 from factorlib.align.silhouette import with_prior_focal
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import CameraSource, DatasetFile, PhotoEntry
-from factorlib.dataset.sources.external_cameras import READERS, match_images
-from factorlib.dataset.sources.source_image import GRID, SourceImage, pinhole
+from factorlib.dataset.sources.external_cameras import READERS
+from factorlib.dataset.sources.source_image import GRID, SourceImage
 from factorlib.dataset_draft import check_target, new_dataset, photos_in
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
@@ -28,13 +25,12 @@ from factorlib.images.picture import picture, write_png
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
 from factorlib.labels.mask_files import read_values
-from factorlib.onboarding.hull_agreement import agreement, focal_length
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, alpha_matte, foreground
-from factorlib.onboarding.photo_folder import Cameras, PhotoFolder, stem_of
+from factorlib.onboarding.photo_folder import Cameras, folder_and_stem
+from factorlib.shapes.hull import agreements, focal_by_hull
 from factorlib.shapes.motion import PhotoForMotion, cameras_by_motion
 from factorlib.shapes.outline import Outline
 
-log = logging.getLogger("factorlib.onboarding")
 MOST_PIXELS = 1_000_000  # pixels of a photo for mattes and structure from motion
 DISAGREES = 0.8  # a mask's agreement with the hull of the others, as a share of the median one, below which it is named
 FOCAL_KEYS = ("fl_x", "camera_angle_x")
@@ -92,32 +88,31 @@ def dataset_from_photos(
         InputError: As `new_dataset` does, and if a photo needs a network that is not installed.
     """
     check_target(target)
-    images, contents = photos_in(photos)
+    images, masks, source = photos_in(photos)
     cameras = Cameras()
     outlines: list[Outline] = []
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        views = read_views(images, contents, model, folder, lambda share, text: report(share / 2, text))
+        views = read_views(images, masks, model, folder, lambda share, text: report(share / 2, text))
         visible = {name: view for name, view in views.items() if view.small.objects.any()}
-        if contents.cameras:
-            paths = {name: path.relative_to(photos).as_posix() for name, path in images.items()}
-            cameras, outlines = cameras_of_folder(visible, paths, contents.cameras, folder, report)
+        if source:
+            cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
         elif not meshes:
             cameras, outlines = cameras_of_motion(visible, report)
         report(0.95, "agreement of the masks")
         doubts = doubtful_masks(views, outlines)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
-    return missing + [SHAPE] * (not cameras.source and not meshes), [ONE_LIGHT] * bool(contents.cameras) + doubts
+    return missing + [SHAPE] * (not cameras.source and not meshes), cameras.notes + doubts
 
 
 def read_views(
-    images: Mapping[str, Path], contents: PhotoFolder, model: Path | None, folder: Path, report: Report
+    images: Mapping[str, Path], masks: Mapping[str, Path], model: Path | None, folder: Path, report: Report
 ) -> dict[str, View]:
-    """Read the photos, and write the mask of each to masks/ in a folder; one without a foreground gets none.
+    """Read the photos, and write the mask of each to masks/ in a folder, empty without a foreground.
 
     Args:
         images: the photos by name
-        contents: the masks beside them
+        masks: masks that lie beside them, by the stems of their names
         model: ONNX file of a matting network; None: that of the extra `masks`
         folder: a temporary folder
         report: called with the completed share and the current activity
@@ -132,7 +127,7 @@ def read_views(
         photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), path)
         pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
         uncertain = 0.0
-        if file := contents.masks.get(stem_of(path.name)):
+        if file := masks.get(folder_and_stem(path.name)[1]):
             values = read_values(file, "PHOTOS", opened.size)
             mask = values > (127 if values.max() > 127 else 0)
         elif (alpha := alpha_matte(path)) is not None:
@@ -141,8 +136,7 @@ def read_views(
             network = network or MatteModel(model)
             matte, uncertain = network(pixels, opened.size)
             mask = foreground(matte)
-        if mask.any():
-            write_png(folder / "masks" / f"{name}.png", mask[..., None].astype(np.uint8))
+        write_png(folder / "masks" / f"{name}.png", mask[..., None].astype(np.uint8))
         objects = box_majority(mask, photo.factor)
         camera = Camera(photo.width, photo.height, 1.0, (photo.width / 2, photo.height / 2))
         prior = with_prior_focal(camera, photo.focal_px, "exif")
@@ -152,7 +146,7 @@ def read_views(
 
 
 def cameras_of_folder(
-    views: Mapping[str, View], paths: Mapping[str, str], cameras: Cameras, folder: Path, report: Report
+    views: Mapping[str, View], paths: Mapping[str, Path], cameras: Cameras, folder: Path, report: Report
 ) -> tuple[Cameras, list[Outline]]:
     """Complete the cameras that lie in the folder of the photos, and return the outlines by them, too.
 
@@ -161,7 +155,7 @@ def cameras_of_folder(
 
     Args:
         views: the photos with a foreground
-        paths: path of each photo in its folder
+        paths: path of each photo
         cameras: the cameras as they lie there
         folder: a temporary folder
         report: called with the completed share and the current activity
@@ -171,6 +165,7 @@ def cameras_of_folder(
         """Return the outlines, by another focal length if it is given."""
         return [view.outline(name, images[name], focal) for name, view in views.items() if name in images]
 
+    notes = [ONE_LIGHT]
     content = json.loads(cameras.files[0].read_text()) if "transforms" in cameras.source else {}
     if content and not any(key in lens for lens in (content, *content["frames"]) for key in FOCAL_KEYS):
         height, width = next(iter(views.values())).size
@@ -179,39 +174,40 @@ def cameras_of_folder(
         write_json(file, content)
         cameras = Cameras({"transforms": f"cameras/{file.name}"}, folder, [file])
         images = match_source(paths, cameras)
-        focal = focal_length(outlines, max(width, height), lambda share: report(0.5 + share / 2, "focal length"))
+        focal = focal_by_hull(outlines, max(width, height), lambda share: report(0.5 + share / 2, "focal length"))
         write_json(file, content | {"fl_x": round(focal, 1)})
-        log.warning("the cameras have no focal length: a hull fits the masks best at %.0f px, which is used", focal)
+        notes.append(f"the cameras have no focal length: a hull fits the masks best at {focal:.0f} px, which is used")
     images = match_source(paths, cameras)
-    by_photo: dict[str, dict[str, Any]] = {name: {"illumination": "room"} for name in images}
-    for name, view in views.items():
-        if name in images and (lens := radial_lens(images[name], view.size[1])):
-            by_photo[name]["camera"] = lens
+    shared = {"illumination": "room"}
+    by_photo = {
+        name: shared | radial_lens(images[name], view.size[1]) for name, view in views.items() if name in images
+    }
     source = cameras.source | {"world_from_camera": True}
-    return msgspec.structs.replace(cameras, source=source, by_photo=by_photo), outlines()
+    return msgspec.structs.replace(cameras, source=source, by_photo=by_photo, notes=notes), outlines()
 
 
-def match_source(paths: Mapping[str, str], cameras: Cameras) -> dict[str, SourceImage]:
+def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, SourceImage]:
     """Return the image of each photo in a source of cameras, whose files are still where they lie."""
     assert cameras.folder is not None  # a source of files
-    kind, path = next(iter(cameras.source.items()))
-    photos = [PhotoEntry(name, path, "") for name, path in paths.items()]
-    spec = DatasetFile(format=1, materials=[], photos=photos, cameras=CameraSource(**cameras.source))
+    kind, place = next(iter(cameras.source.items()))
     refuse = Refusal(cameras.folder, cameras.folder)
-    return match_images(spec, kind, READERS[kind](path.removeprefix("cameras/"), refuse), refuse)
+    images = READERS[kind](place.removeprefix("cameras/"), refuse)
+    by_key = {folder_and_stem(str(image.name)): image for image in images}
+    keys = {name: folder_and_stem(str(path)) for name, path in paths.items()}
+    matches = {name: by_key.get(key) or by_key.get(("", key[1])) for name, key in keys.items()}
+    return {name: image for name, image in matches.items() if image}
 
 
-def radial_lens(image: SourceImage, width: int) -> dict[str, Any] | None:
-    """Return the key `camera` of a photo whose camera is no pinhole, by least squares; None for a pinhole.
+def radial_lens(image: SourceImage, width: int) -> dict[str, Any]:
+    """Return the key `camera` of a photo whose lens distorts, by least squares over its image; empty for a pinhole.
 
     Args:
         image: the photo's image in the source
         width: width of the photo, pixels
     """
     camera = image.camera
-    with suppress(InputError):
-        pinhole(camera, image.key, Refusal(Path(), Path()))
-        return None
+    if camera.is_undistorted():
+        return {}
     centre = np.array([camera.principal_point_x, camera.principal_point_y])
     pixels = np.indices((GRID, GRID)).reshape(2, -1).T / (GRID - 1) * [camera.width, camera.height]
     slopes = np.asarray(camera.cam_from_img(pixels))
@@ -219,9 +215,9 @@ def radial_lens(image: SourceImage, width: int) -> dict[str, Any] | None:
     powers = (slopes**2).sum(axis=1, keepdims=True) ** np.arange(3)
     design = (slopes[:, :, None] * powers[:, None]).reshape(-1, 3)
     focal, *bends = np.linalg.lstsq(design, (pixels - centre).ravel())[0].tolist()
-    scale = width / camera.width
-    distortion = [round(bend / focal, 5) for bend in bends]
-    return {"focal_px": scale * focal, "principal_point": (scale * centre).tolist(), "distortion": distortion}
+    place = (width / camera.width * centre).tolist()
+    distortion = [bend / focal for bend in bends]
+    return {"camera": {"focal_px": width / camera.width * focal, "principal_point": place, "distortion": distortion}}
 
 
 def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Cameras, list[Outline]]:
@@ -250,7 +246,7 @@ def doubtful_masks(views: Mapping[str, View], outlines: list[Outline]) -> list[s
         views: the photos
         outlines: outlines by known cameras
     """
-    overlaps = agreement(outlines) if len(outlines) > 2 else []
+    overlaps = agreements(outlines) if len(outlines) > 2 else []
     groups = {
         "its border is uncertain": [name for name, view in views.items() if view.doubt > MOST_DOUBT],
         "it differs from what the other photos show": [

@@ -16,8 +16,6 @@ from scipy import ndimage
 from factorlib.errors import InputError
 from factorlib.reading import reading
 
-PACKAGE = "rembg"  # the package of the extra `masks`
-MODEL = "u2netp.onnx"  # the model in it
 WITHOUT = "make setup EXTRAS=masks, or name a model with MATTE=<file.onnx>; or use photos with an alpha channel"
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of ImageNet's colours, by which models are trained
 DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
@@ -35,9 +33,8 @@ def alpha_matte(path: Path) -> Matte | None:
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         return None
     with reading("an image", path, "PHOTOS"), Image.open(path) as image:
-        if "A" not in image.getbands():
-            return None
-        alpha = np.asarray(ImageOps.exif_transpose(image).getchannel("A"), np.float32) / 255
+        rgba = ImageOps.exif_transpose(image).convert("RGBA")
+    alpha = np.asarray(rgba)[..., 3] / np.float32(255)
     return None if alpha.min() == 1 else alpha
 
 
@@ -65,18 +62,17 @@ class MatteModel:
     """
 
     def __init__(self, path: Path | None = None):
-        package = find_spec(PACKAGE)
+        package = find_spec("rembg")  # the package of the extra `masks`
         if find_spec("onnxruntime") is None or (path is None and (package is None or package.origin is None)):
             raise InputError("automatic masks need a network, which is not installed", key="MATTE", cure=WITHOUT)
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 4
-        path = path or Path(str(package.origin)).with_name(MODEL)  # type: ignore[union-attr]
+        path = path or Path(str(package.origin)).with_name("u2netp.onnx")  # type: ignore[union-attr]
         with reading("an ONNX model", path, "MATTE", "give a model of rembg's form", also=(Exception,)):
             self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
             self.input = self.session.get_inputs()[0]
-            self.sides = [side if isinstance(side, int) else SIDE for side in self.input.shape[2:]]
 
     def __call__(self, pixels: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> tuple[Matte, float]:
         """Return the matte of a photo.
@@ -88,7 +84,7 @@ class MatteModel:
         Returns:
             The matte, and its doubt in pixels of a matte of SIDE pixels.
         """
-        height, width = self.sides
+        height, width = (side if isinstance(side, int) else SIDE for side in self.input.shape[2:])
         small = np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.LANCZOS), np.float32)
         small = (small / max(small.max(), 1) - MEAN) / DEVIATION
         matte = self.session.run(None, {self.input.name: small.transpose(2, 0, 1)[None]})[0].reshape(height, width)

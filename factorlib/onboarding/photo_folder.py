@@ -30,54 +30,50 @@ class Cameras(msgspec.Struct):
         folder: folder of its files
         files: its files, to be copied to cameras/ as they lie in the folder
         by_photo: further keys of photos in dataset.yaml
+        notes: assumptions, in words
     """
 
     source: dict[str, Any] = {}
     folder: Path | None = None
     files: list[Path] = []
     by_photo: dict[str, dict[str, Any]] = {}
+    notes: list[str] = []
 
 
-class PhotoFolder(msgspec.Struct):
-    """Contents of a folder of photographs.
+def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict[str, Path], Cameras | None]:
+    """Sort the files of a folder and its subfolders.
 
-    Attributes:
-        images: the photos
-        masks: mask of a photo by the stem of its name, where there is one
-        cameras: cameras of the photos, if files give them
+    Returns:
+        The photos, their masks by the stems of their names, and their cameras, if files give these.
     """
-
-    images: list[Path]
-    masks: dict[str, Path]
-    cameras: Cameras | None = None
-
-
-def read_photo_folder(folder: Path, files: list[Path]) -> PhotoFolder:
-    """Sort the files of a folder and its subfolders."""
     pictures = [path for path in files if path.suffix.lower() in IMAGES]
-    stems = {stem_of(path.name) for path in pictures}
+    stems = {path.stem for path in pictures}
     masks = {stem: path for path in pictures if (stem := _masked_stem(path.relative_to(folder), stems))}
     images = sorted(set(pictures).difference(masks.values()))
     cameras, names = _cameras(folder, files)
     if cameras:
-        named = {stem_of(name): cameras.files[0].parent / str(mask) for name, mask in names.items()}
+        named = {folder_and_stem(name)[1]: cameras.files[0].parent / str(mask) for name, mask in names.items()}
         masks |= {stem: path for stem, path in named.items() if path in files}
-        images = _named_images(folder, images, names) or images
+        images = _named_images(images, names) or images
     else:
         images = [path for path in images if path.parent == folder] or images
-    return PhotoFolder(images, masks, cameras)
+    return images, masks, cameras
 
 
-def stem_of(name: str) -> str:
-    """Return a file's name without folder and without the suffix of an image: "r_0.5" has none."""
+def folder_and_stem(name: str) -> tuple[str, str]:
+    """Return the folder in a file's path, and its name without the suffix of an image; "r_0.5" has none.
+
+    >>> folder_and_stem("./train/r_0.5"), folder_and_stem("0001.png")
+    (('train', 'r_0.5'), ('', '0001'))
+    """
     path = PurePosixPath(name)
-    return path.stem if path.suffix.lower() in IMAGES else path.name
+    return path.parent.name, path.stem if path.suffix.lower() in IMAGES else path.name
 
 
 def _masked_stem(path: Path, stems: set[str]) -> str | None:
     """Return the stem of the photo whose mask an image is; None if it is a photo."""
     stem = path.stem.removesuffix("_mask")
-    inner = stem_of(stem)
+    inner = folder_and_stem(stem)[1]
     named = inner in stems and inner != path.stem
     in_folder = any(part.lower().startswith("mask") for part in path.parts[:-1])
     return inner if path.suffix.lower() == ".png" and (named or in_folder) else None
@@ -104,16 +100,10 @@ def _cameras(folder: Path, files: list[Path]) -> tuple[Cameras | None, dict[str,
     return Cameras({"colmap": f"cameras/{place}"}, folder, model), {str(image.name): None for image in images}
 
 
-def _named_images(folder: Path, images: list[Path], names: Iterable[str]) -> list[Path]:
-    """Return the images that a source of cameras names, of one folder if it names none."""
-    wanted = {(PurePosixPath(name).parent.name, stem_of(name)) for name in names}
-    exact = [path for path in images if (path.parent.name, stem_of(path.name)) in wanted]
-    if exact:
-        return exact
-    named = [path for path in images if stem_of(path.name) in {stem for _, stem in wanted}]
-    # smaller copies may lie in images_2 and images_4: take the folder of most images, and of these that of most bytes
-    sizes: dict[Path, list[int]] = {}
-    for path in named:
-        sizes.setdefault(path.parent, []).append(path.stat().st_size)
-    best = max(sizes, key=lambda parent: (len(sizes[parent]), sum(sizes[parent])), default=folder)
-    return [path for path in named if path.parent == best]
+def _named_images(images: list[Path], names: Iterable[str]) -> list[Path]:
+    """Return the images that a source of cameras names, each from the largest file if it names no folders."""
+    wanted = {folder_and_stem(name) for name in names}
+    exact = [path for path in images if folder_and_stem(str(path)) in wanted]
+    stems = {stem for _, stem in wanted}
+    by_size = sorted((path for path in images if path.stem in stems), key=lambda path: path.stat().st_size)
+    return exact or sorted({path.stem: path for path in by_size}.values())

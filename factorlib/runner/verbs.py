@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import inspect
+import logging
 import os
 import signal
 import sys
@@ -86,7 +87,7 @@ def _print_results(state: DatasetState, whole: bool) -> str:
 
 
 def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
-    from factorlib.runner.display import Display
+    from factorlib.runner.display import Display, warning_lines
     from factorlib.runner.run import run
 
     started = time.perf_counter()
@@ -101,6 +102,7 @@ def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
     finally:
         display.close()
     name = state.data.folder.name
+    print(*(f"{line}\n" for line in warning_lines(result.warnings)), sep="", end="", file=sys.stderr)
     if failed := list(result.failed):
         print(f"{name}: {count(failed)} failed: {summarize(failed, MOST_FAILED, ', ')}")
         if result.held_up:
@@ -287,9 +289,13 @@ def _shown(name: str) -> Iterator[Callable[..., None]]:
     from factorlib.runner.display import Display
 
     step = Step(name)
-    with contextlib.closing(Display()) as display:
-        display.start(step)
-        yield partial(display.progress, step)
+    logging.disable(logging.WARNING)  # A run repeats the warnings of its photos.
+    try:
+        with contextlib.closing(Display()) as display:
+            display.start(step)
+            yield partial(display.progress, step)
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def label_masks(project: Project, dataset: str, port: int) -> int:
