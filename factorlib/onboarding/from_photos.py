@@ -180,7 +180,7 @@ def cameras_of_folder(
     images = match_source(paths, cameras)
     shared = {"illumination": "room"}
     by_photo = {
-        name: shared | radial_lens(images[name], view.size[1]) for name, view in views.items() if name in images
+        name: shared | distorted_camera(images[name], view.size[1]) for name, view in views.items() if name in images
     }
     source = cameras.source | {"world_from_camera": True}
     return msgspec.structs.replace(cameras, source=source, by_photo=by_photo, notes=notes), outlines()
@@ -198,7 +198,7 @@ def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, Sourc
     return {name: image for name, image in matches.items() if image}
 
 
-def radial_lens(image: SourceImage, width: int) -> dict[str, Any]:
+def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
     """Return the key `camera` of a photo whose lens distorts, by least squares over its image; empty for a pinhole.
 
     Args:

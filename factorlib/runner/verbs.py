@@ -278,7 +278,8 @@ def begin(
         print(f"  no contact sheet: {fault}")
     if auto and not missing:
         return validate(project, dataset, [])
-    first = "" if masks or auto else f"name your materials in it, then {project.command('label', dataset)}, then "
+    label = f"name your materials in it, then {project.command('label', dataset)}, then "
+    first = label * any("`make label`" in line for line in missing)
     print(f"next: {first}{project.command('validate', dataset)}")
     return 0
 
