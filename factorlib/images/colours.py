@@ -26,8 +26,8 @@ def count_colours(radiance: Float[np.ndarray, "n 3"]) -> int:
     if len(bright) < LEAST_PIXELS:
         return 1
     ratios = np.log(bright[:, [0, 2]] / bright[:, [1]])
-    histogram = np.histogram2d(ratios[:, 0], ratios[:, 1], bins=BINS)[0] / len(bright)
-    density = ndimage.gaussian_filter(histogram, 1.0, mode="constant")
+    counts = np.histogram2d(ratios[:, 0], ratios[:, 1], bins=BINS)[0]
+    density = ndimage.gaussian_filter(counts / len(bright), 1.0, mode="constant")
     modes = [1]
     for level in density.max() * LEVELS:
         pieces, number = ndimage.label(density >= level, np.ones((3, 3)))

@@ -64,9 +64,9 @@ class View(msgspec.Struct, frozen=True):
         camera = self.small.camera
         scale = camera.width / (image.size[0] if image.size else self.size[1])
         centre = (scale * image.camera.principal_point_x, scale * image.camera.principal_point_y)
-        centred = image.centred or image.size is None or image.size[1] is None
-        focal = scale * (focal or image.camera.mean_focal_length())
-        camera = msgspec.structs.replace(camera, focal=focal, centre=camera.centre if centred else centre)
+        if image.centred or image.size is None or image.size[1] is None:
+            centre = camera.centre
+        camera = Camera(camera.width, camera.height, scale * (focal or image.camera.mean_focal_length()), centre)
         assert image.cam_from_world is not None  # the sources of a folder have a world
         pose = Pose(image.cam_from_world.rotation.matrix(), np.array(image.cam_from_world.translation))
         return Outline(name, self.small.objects.astype(int), camera, pose=pose)
@@ -174,7 +174,7 @@ def cameras_of_folder(
         write_json(file, content)
         cameras = Cameras({"transforms": f"cameras/{file.name}"}, folder, [file])
         images = match_source(paths, cameras)
-        focal = focal_by_hull(outlines, max(width, height), lambda share: report(0.5 + share / 2, "focal length"))
+        focal = focal_by_hull(outlines, max(width, height), lambda share: report(0.5 + 0.4 * share, "focal length"))
         write_json(file, content | {"fl_x": round(focal, 1)})
         notes.append(f"the cameras have no focal length: a hull fits the masks best at {focal:.0f} px, which is used")
     images = match_source(paths, cameras)
@@ -229,7 +229,7 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
     """
     photos = {name: view.small for name, view in views.items()}
     try:
-        registered = cameras_by_motion(photos, lambda share, text: report(0.5 + share / 2, text))
+        registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.4 * share, text))
     except InputError:
         return Cameras(), []
     outlines = []

@@ -224,8 +224,7 @@ def focal_by_hull(
         return -hull_overlap(outlines(float(np.exp(log))))
 
     bounds = np.log(longest * np.array(FOCALS))
-    options = {"maxiter": TRIALS, "xatol": 0.005}
-    return float(np.exp(minimize_scalar(misfit, bounds=bounds, method="bounded", options=options).x))
+    return float(np.exp(minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": TRIALS}).x))
 
 
 def _sample(

@@ -33,9 +33,7 @@ def cut_outs(tmp_path):
         alpha[:, : 150 * (number == 5)] = True
         picture = np.dstack([np.full((*alpha.shape, 3), 120), 255 * alpha]).astype(np.uint8)
         Image.fromarray(picture).save(tmp_path / "capture" / "images" / f"{number}.png")
-        matrix = np.eye(4)
-        matrix[:3, :3] = pose.rotation.T * [1, -1, -1]
-        matrix[:3, 3] = -pose.rotation.T @ pose.translation
+        matrix = np.column_stack([pose.rotation.T * [1, -1, -1], -pose.rotation.T @ pose.translation])
         frames.append({"file_path": f"./images/{number}", "transform_matrix": matrix.tolist()})
     (tmp_path / "capture" / "transforms.json").write_text(json.dumps({"frames": frames}))
     return tmp_path
