@@ -113,8 +113,7 @@ def new_dataset(
         cameras: cameras of the photos; None: those that lie among them
 
     Raises:
-        InputError: The target exists or cannot be created, or a folder is missing or has no photos.  It is also raised
-            for a link, an unprintable file name, and too many pixels.
+        InputError: The target exists, or a folder is missing, has no photos, or a link or a file with too many pixels.
     """
     above = check_target(target)
     images, photo_masks, source = photos_in(photos)
@@ -141,7 +140,7 @@ def new_dataset(
     spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled)}
     spec["photos"] = [photo | cameras.by_photo.get(photo["name"], {}) for photo in spec["photos"]]
     sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
-    sources |= {"cameras": (cameras.folder, cameras.files)}
+    sources["cameras"] = cameras.folder, cameras.files
     places = {name: (folder, files) for name, (folder, files) in sources.items() if folder}
     _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     _write(target, spec, places, above)
