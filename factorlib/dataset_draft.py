@@ -1,7 +1,9 @@
 """Draft of a dataset.yaml for a user's own photos: `make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…`.
 
 The files are copied to data/<name>/.  A mask belongs to the photo of the same name: `kitchen.png` with labels,
-`kitchen_oak.png` or `kitchen/oak.png` for one material, or one COCO json for all.  Beside a mask with labels,
+`kitchen_oak.png` or `kitchen/oak.png` for one material, `kitchen.json` of labelme, one COCO json for all, or CVAT's
+masks with labelmap.txt.  A `kitchen.png` without labels, or the alpha of a photo, is the silhouette of one material.
+Beside a mask with labels,
 `kitchen_chair1.png` is the silhouette of an object.  Materials are the names in those, or label_1, label_2, … for
 labels.
 
@@ -29,15 +31,22 @@ from factorlib.align.silhouette import UNKNOWN as HIDES
 from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
 from factorlib.dataset.read_dataset import UNKNOWN
-from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME, MAX_MATERIALS
+from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME
 from factorlib.errors import InputError
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.labels.label_image import read_labels
-from factorlib.labels.mask_files import Category, read_inside, read_values
+from factorlib.labels.mask_files import (
+    BACKGROUND,
+    is_cut_out,
+    read_annotations,
+    read_inside,
+    read_labelmap,
+    read_labels_in,
+)
 from factorlib.meshes.read_mesh import read_mesh, read_parts
 from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder
-from factorlib.reading import read_bytes, reading
+from factorlib.reading import reading
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
 
@@ -51,6 +60,7 @@ in parts of a mask's
 # Least margin of a certain pairing, in wrong pixels over the mask's.  Data sets with truth have 0.7 and more.
 MARGIN = 0.1
 MOST_OBJECTS = 200  # objects of one mesh that are examined, at 0.3 s each
+LABELMAP = "labelmap.txt"  # names of the colours in CVAT's masks
 SIDE = 400  # longest side of a silhouette for pairing, pixels
 BESIDE = "\x1f"  # separates a value from the comment beside it
 HULL = "thing"  # name of the mesh if none is given
@@ -68,12 +78,6 @@ NO_MASKS = (
 
 NO_MATERIAL = "no mask names a material: write the names in `materials`, label k of a mask the k-th"
 RESERVED = "photo {0}: write another `name`: a file of the results is called {0}"
-
-
-class Categories(msgspec.Struct):
-    """The part of a COCO file that names materials."""
-
-    categories: list[Category]
 
 
 class Masks(msgspec.Struct):
@@ -117,15 +121,14 @@ def new_dataset(
     """
     above = check_target(target)
     images, photo_masks, source = photos_in(photos)
-    mask_files = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks else sorted(photo_masks.values())
-    if masks is None and mask_files:
-        masks = Path(os.path.commonpath([path.parent for path in mask_files]))
+    masks, mask_files = _mask_files(masks, sorted(photo_masks.values()))
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes else []  # including .mtl and buffers
     missing: list[str] = []
-    labelled = _masks(masks, mask_files, list(images), missing) if masks else Masks()
+    paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
+    labelled = _masks(masks, mask_files, list(images), missing) if masks else _cut_outs(paths, images, missing)
     entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
-    missing += _missing_masks(list(images), labelled) if masks else [NO_MASKS]
+    missing += _missing_masks(list(images), labelled) if masks or labelled.by_photo else [NO_MASKS]
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
         missing += [] if cameras or source else [NO_MESH]
@@ -136,7 +139,6 @@ def new_dataset(
     spec |= {"cameras": cameras.source} if cameras.source else {}
     missing += [NO_MATERIAL] * (not labelled.materials and masks is not None)
     missing += [RESERVED.format(photo) for photo in images if photo in RESERVED_PHOTOS]
-    paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
     spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled)}
     spec["photos"] = [photo | cameras.by_photo.get(photo["name"], {}) for photo in spec["photos"]]
     sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
@@ -145,6 +147,13 @@ def new_dataset(
     _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     _write(target, spec, places, above)
     return missing
+
+
+def _mask_files(masks: Path | None, beside: list[Path]) -> tuple[Path | None, list[Path]]:
+    """Return the folder of masks and its files; without a folder, that of the masks beside the photos, if any."""
+    if masks is None:
+        return (Path(os.path.commonpath([path.parent for path in beside])), beside) if beside else (None, [])
+    return masks, _files(masks, (".png", ".json", LABELMAP), "MASKS", deep=True)
 
 
 def check_target(target: Path) -> Path:
@@ -230,44 +239,84 @@ def _copy(source: Path, target: Path, files: Iterable[Path]) -> None:
 
 
 def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str]) -> Masks:
-    """Return the masks in a folder, of a COCO file or of PNGs."""
+    """Return the masks in a folder: of a labelmap.txt, of json files, or of PNGs."""
     file = {path: f"masks/{path.relative_to(folder)}" for path in paths}
-    if coco := [path for path in paths if path.suffix.lower() == ".json"]:
-        materials = _coco_materials(coco[0], file[coco[0]], missing)
-        missing += [f"{file[path]}: a second COCO file is not used" for path in coco[1:]]
-        return Masks(materials, dict.fromkeys(photos, file[coco[0]]))
+    if sources := [path for path in paths if path.suffix.lower() != ".png"]:
+        return _annotated_masks(file, sources, photos, missing)
     labels = 0
     names: dict[str, None] = {}
+    outlines = []
     masks = Masks()
     whole, further = _masks_by_photo(folder, paths, photos)
     for photo in photos:
         each = {name: file[path] for name, path in sorted(further[photo].items())}
         if photo in whole:
             values = _labels_in(whole[photo], photo)
-            labels = max([labels, *(value for value in values if value <= MAX_MATERIALS)])
-            if values <= {0, LEFT_OUT}:
-                cure = f"the mask of one material is called {photo}_<material>.png"
-                fault = f"{whole[photo].name} has no label, for {LEFT_OUT} means left out"
-                missing.append(f"photo {photo}: {fault}; {cure}")
+            labels = max([labels, *values])
+            outlines += [photo] * (not values)
             masks.by_photo[photo] = file[whole[photo]]
             masks.silhouettes[photo] = each
         elif each:
             masks.by_photo[photo] = each
             names |= dict.fromkeys(each)
-    masks.materials = list(names) or [f"label_{k}" for k in range(1, labels + 1)]
+    masks.materials = list(names) or [f"label_{k}" for k in range(1, max(labels, bool(outlines)) + 1)]
+    _name_outlines(masks, outlines, missing)
     return masks
 
 
-def _coco_materials(path: Path, file: str, missing: list[str]) -> list[str]:
-    """Return the materials of a COCO file, by names that a dataset.yaml can have."""
-    with reading("COCO", path, cure="it needs images, annotations and categories"):
-        categories = msgspec.json.decode(read_bytes(path, "COCO"), type=Categories).categories
-    names = {category.name: _word(category.name) for category in categories}
+def _annotated_masks(file: dict[Path, str], sources: list[Path], photos: list[str], missing: list[str]) -> Masks:
+    """Return the PNGs of a labelmap.txt, or the json of each photo or of all; `file` has their paths in the dataset."""
+    suffix = ".png" if sources[0].name == LABELMAP else ".json"
+    entries = [path for path in file if path.suffix.lower() == suffix and path.parent.name != "SegmentationObject"]
+    masks = Masks(by_photo={_word(path.stem): file[path] for path in entries if _word(path.stem) in photos})
+    if not masks.by_photo:
+        masks.by_photo = dict.fromkeys(photos, file[sources[0]])
+        missing += [f"{file[path]}: a second COCO file is not used" for path in sources[1:]]
+        sources = sources[:1]
+    names = [name for path in sources for name in _annotated_materials(path, file[path], missing)]
+    masks.materials = list(dict.fromkeys(names))
+    return masks
+
+
+def _name_outlines(masks: Masks, photos: Iterable[str], missing: list[str]) -> None:
+    """Make masks without labels, by photo, silhouettes of the only material, and say so."""
+    for photo in photos:
+        mask = masks.by_photo[photo]
+        if len(masks.materials) == 1:
+            masks.by_photo[photo] = {masks.materials[0]: str(mask)}
+            missing.append(
+                f"photo {photo}: {mask} has no labels: cut at half, it is the silhouette of {masks.materials[0]}"
+            )
+        else:
+            cure = f"the mask of one material is called {photo}_<material>.png"
+            missing.append(f"photo {photo}: {mask} has no label, for {LEFT_OUT} means left out; {cure}")
+
+
+def _cut_outs(photos: Mapping[str, str], images: Mapping[str, Path], missing: list[str]) -> Masks:
+    """Return as masks the transparency of photos that have one."""
+    masks = Masks()
+    for name, path in images.items():
+        with suppress(InputError):  # `validate` reports a photo that cannot be read
+            check_pixels(open_photo(path).size, MOST_MEGAPIXELS, path)
+            if path.suffix.lower() == ".png" and is_cut_out(path, name):
+                masks.by_photo[name] = photos[name]
+                masks.materials = ["label_1"]
+    _name_outlines(masks, list(masks.by_photo), missing)
+    return masks
+
+
+def _annotated_materials(path: Path, file: str, missing: list[str]) -> list[str]:
+    """Return the materials of a labelmap.txt or a json, by names that a dataset.yaml can have."""
+    if path.name == LABELMAP:
+        found = [name for name in read_labelmap(path).values() if name != BACKGROUND]
+    else:
+        found = [category.name for category in read_annotations(path).categories]
+    names = {name: _word(name) for name in found}
     for name, word in names.items():
         if word != name:
             letters = "names are made of A-Z a-z 0-9 _ and -"
             missing.append(f"{file}: rename its category {name!r} to {word!r}: {letters}")
-    return list(dict.fromkeys(names.values()))
+    return list(names.values())
 
 
 def _masks_by_photo(
@@ -292,11 +341,11 @@ def _masks_by_photo(
 
 
 def _labels_in(path: Path, photo: str) -> set[int]:
-    """Return the values of the pixels of a mask.  Raises InputError for a file that is not a PNG or too large."""
+    """Return the labels in a mask.  Raises InputError for a file that is not a PNG or too large."""
     with reading("a PNG", path, photo, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as png:
         size = png.size
     check_pixels(size, MOST_MEGAPIXELS, path, photo)
-    return set(np.unique(read_values(path, photo)).tolist())
+    return read_labels_in(path, photo)
 
 
 def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict[str, Any]]:
@@ -385,13 +434,13 @@ def _meshes_named_in(photo: str, meshes: Collection[str]) -> list[str]:
 def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool = False) -> list[Path]:
     """Return the files of a folder, sorted, without those that macOS keeps beside a file (`._name`).
 
-    `deep` includes its subfolders.  `suffixes` is None for any suffix.
+    `deep` includes its subfolders.  `suffixes` are ends of their names, None for any.
     """
     if not folder.is_dir():
         raise InputError("there is no such folder", file=folder, key=key, cure="correct the path")
     paths = []
     for path in folder.rglob("*") if deep else folder.iterdir():
-        if path.name.startswith("._") or (suffixes is not None and path.suffix.lower() not in suffixes):
+        if path.name.startswith("._") or (suffixes is not None and not path.name.lower().endswith(suffixes)):
             continue
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
             cure = "put a copy of the file there, or remove it"

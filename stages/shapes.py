@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from factorlib.align.input_checks import camera_of_photo
-from factorlib.align.silhouette import UNKNOWN, silhouette_of_object, with_prior_focal
+from factorlib.align.silhouette import EXIF_SIGMA, UNKNOWN, silhouette_of_object, with_prior_focal
 from factorlib.dataset.check import ALL_OF_IT
 from factorlib.dataset.schema import ExternalCamera, MeshEntry, MeshInstance, ObjectsSlice, RigidTransform, ShapesSlice
 from factorlib.errors import InputError
@@ -128,6 +128,9 @@ def estimate_shape(
         raise InputError("no photo's mask shows it", cure="give its material a label in the masks, or remove the mesh")
     if entry.hull:
         posed = [outline for outline in outlines if outline.pose is not None]
+        if any(outline.focal_sigma > EXIF_SIGMA for outline in posed):
+            cure = "write `camera: {focal_px: …}` of each photo, or give photos with their EXIF"
+            raise InputError("a hull needs the focal lengths of its photos, and one is unknown", cure=cure)
         if 2 <= len(posed) < FEW:
             log.warning(
                 "a hull of %d outlines is larger than the body where no outline limits it: add photos from more sides",

@@ -118,7 +118,7 @@ def warn_of_camera(focal: float | None, centre: tuple[float, float], size: tuple
             )
 
 
-def convert_intrinsics(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float, Vec2]:
+def convert_intrinsics(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float | None, Vec2]:
     """Convert focal length and principal point of an external source's image to pixels of the photo, as displayed.
 
     Args:
@@ -128,7 +128,7 @@ def convert_intrinsics(external: ExternalCamera, width: int, height: int, photo:
         photo: Name of the photo.
 
     Returns:
-        Focal length and principal point (x, y).
+        Focal length, None if the source does not give it, and principal point (x, y).
 
     Raises:
         InputError: If the photo is not the image at another size, but was cropped, rotated or squeezed.
@@ -151,7 +151,8 @@ def convert_intrinsics(external: ExternalCamera, width: int, height: int, photo:
         )
     if fault:
         raise InputError(fault, file="dataset.yaml", key=f"cameras.{external.source}: {photo}", cure=cure)
-    return external.focal_px * (across if width >= height else down), centre
+    scale = across if width >= height else down
+    return None if external.focal_px is None else external.focal_px * scale, centre
 
 
 def _compare_sizes(image: tuple[float, float], photo: tuple[int, int]) -> tuple[str | None, str | None]:
@@ -194,7 +195,7 @@ def camera_of_photo(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tupl
     centre = (width / 2, height / 2)
     if slice_.external is not None and (source != "dataset" or slice_.camera.principal_point is None):
         external_focal, centre = convert_intrinsics(slice_.external, width, height, photo)
-        if source != "dataset":
+        if source != "dataset" and external_focal is not None:
             focal = external_focal / factor
             source = slice_.external.source
     across, down = slice_.camera.principal_point or centre

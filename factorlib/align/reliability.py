@@ -9,6 +9,7 @@ normal_stderr_deg  Angle by which the normals in the mask turn when the pose mov
 mirrored_score     From far away, a body and its mirror image have one outline, from opposite sides. So a mask that was
                    mirrored by mistake fits well with normals that are all wrong. Its mirror image fits better, by
                    perspective and parts. It is searched with less effort, and only where a better fit is possible.
+                   It says nothing of a body that is its own mirror image, and is left out.
 confidence         A coarse mesh does not tell how its surface bends within a face, nor a thin part how it bends within
                    a pixel. The variance of the normal then grows by the factor
 
@@ -29,7 +30,14 @@ from scipy.spatial import cKDTree
 
 from factorlib.align.photo_alignment import ObjectToAlign, PhotoAlignment
 from factorlib.align.refine import PoseState, interpolate, mesh_contour, normal_equations, pose_state, render
-from factorlib.align.search import PoseEstimate, SearchOptions, estimate_pose, normal_difference, render_maps
+from factorlib.align.search import (
+    PoseEstimate,
+    SearchOptions,
+    estimate_pose,
+    normal_difference,
+    refine_finest,
+    render_maps,
+)
 from factorlib.align.silhouette import ObjectView, Silhouette, Target, make_target
 from factorlib.geometry.raster import Caster, Maps
 from factorlib.images.picture import picture as sdr_picture
@@ -116,7 +124,7 @@ def find_doubts(
     if estimate and (mirrored := measures.mirrored_score) is not None:
         scores = f"({mirrored:.3f}, {estimate.score:.3f})"
         fault = f"the mirror image of the mask fits better {scores}: was it mirrored?"
-        doubts.append((1 - mirrored < (1 - estimate.score) / 2, fault))
+        doubts.append((fits_better(mirrored, estimate.score), fault))
     if estimate and (runner_up := estimate.runner_up):
         lead = max(thresholds.least_lead * (1 - runner_up.score), LEAST_SCORE_LEAD)
         fault = f"another pose, its normals {runner_up.normal_difference_deg:.0f}° away, fits as well "
@@ -147,12 +155,36 @@ def measure_reliability(obj: ObjectToAlign, alignment: PhotoAlignment, number: i
     target = make_target(view, caster.mesh.labels, resolution=200)
     if estimate is None:
         return Reliability(contour_error(caster, target, pose_state(alignment.poses[number], alignment.camera, caster)))
-    may_be_mirrored = estimate.score < FITS_TO_A_PIXEL and estimate.source != "keypoints"
-    return Reliability(
-        contour_error(caster, target, estimate.state),
-        normal_stderr_deg(caster, target, estimate.state),
-        estimate_pose(caster, view.mirror(), QUICK).score if may_be_mirrored else None,
-    )
+    mirrored_score = None
+    if estimate.score < FITS_TO_A_PIXEL and estimate.source != "keypoints":
+        mirrored = estimate_pose(caster, view.mirror(), QUICK)
+        if not fits_better(mirrored.score, estimate.score) or not is_own_mirror_image(caster, view, mirrored):
+            mirrored_score = mirrored.score
+    error = contour_error(caster, target, estimate.state)
+    return Reliability(error, normal_stderr_deg(caster, target, estimate.state), mirrored_score)
+
+
+def fits_better(mirrored_score: float, score: float) -> bool:
+    """Return True if the mirror image of a mask fits so much better that the mask may have been mirrored."""
+    return 1 - mirrored_score < (1 - score) / 2
+
+
+def is_own_mirror_image(caster: Caster, view: ObjectView, mirrored: PoseEstimate) -> bool:
+    """Return True if the mesh, mirrored about an axis, fits the mask as well as it fits the mask's mirror image.
+
+    Args:
+        caster: The mesh.
+        view: The mask and the camera.
+        mirrored: Pose that was found for the mirror image of the view.
+    """
+    vertices = caster.mesh.vertices - caster.centre
+    axes = np.concatenate([np.linalg.eigh(vertices.T @ vertices)[1].T, np.eye(3)])
+    for axis in axes:  # F R S is a rotation, where F mirrors the photo and S the mesh
+        rotation = np.diag([-1, 1, 1]) @ mirrored.state.rotation @ (np.eye(3) - 2 * np.outer(axis, axis))
+        state = msgspec.structs.replace(mirrored.state, rotation=rotation, a=-mirrored.state.a)
+        if refine_finest(caster, view, state, QUICK, QUICK.steps[-1]).score > mirrored.score - LEAST_SCORE_LEAD:
+            return True
+    return False
 
 
 def contour_error(caster: Caster, target: Target, state: PoseState) -> float:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-from factorlib.dataset.paths import Refusal
+from factorlib.dataset.paths import Refusal, labelmap_beside
 from factorlib.dataset.schema import (
     RAW,
     SOURCES,
@@ -219,6 +219,8 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
             refuse(f"{key}.masks", "no mask is named", "give a label PNG, a COCO json, or {material: mask.png, …}")
         if isinstance(photo.masks, str):
             refuse.check_path(f"{key}.masks", photo.masks, MASKS)
+            companion = labelmap_beside(photo.masks, refuse.folder) or photo.masks
+            refuse.check_path(f"{key}.masks", companion, (*MASKS, ".txt"))
     for material, path in {} if isinstance(photo.masks, str) else photo.masks.items():
         with refuse.collect_fault():
             refuse.check_known(f"{key}.masks.{material}", material, spec.materials, "material")

@@ -7,13 +7,19 @@ import os
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NoReturn
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain, path_inside, reading
 
 ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1, which matrices typed with four digits satisfy
+
+
+def labelmap_beside(masks: str, folder: Path) -> str | None:
+    """Return the labelmap.txt in the folder of a mask or in the one above, both below the dataset's `folder`."""
+    names = [str(above / "labelmap.txt") for above in PurePosixPath(masks).parents if above.name][:2]
+    return next((name for name in names if (folder / name).is_file()), None)
 
 
 class Refusal:

@@ -282,13 +282,13 @@ class ExternalCamera(msgspec.Struct, frozen=True):
     """The camera of one photo from a source of cameras, in pixels of the source's image.
 
     Attributes:
-        principal_point: None if the source does not give it
+        focal_px: None if the source does not give it, as for principal_point
         size: width and height of the source's image; None if unknown; the height is None for a focal length in widths
         poses: cam_from_object by object, in the mesh's units
     """
 
     source: Literal["colmap", "transforms", "bop", "sfm"]
-    focal_px: float
+    focal_px: float | None
     principal_point: Vec2 | None
     size: tuple[float, float | None] | None
     poses: dict[str, RigidTransform]

@@ -11,6 +11,7 @@ import msgspec
 
 from factorlib.dataset import schema
 from factorlib.dataset.check import instance_materials, mirror_balls
+from factorlib.dataset.paths import labelmap_beside
 from factorlib.dataset.schema import Dataset, PhotoEntry
 from factorlib.errors import did_you_mean
 
@@ -74,7 +75,9 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
         objects=[schema.ObjectMask(obj.name, obj.mask) for obj in photo.objects],
         camera=photo.camera if photo.camera and photo.camera.distortion else None,
     )
-    masks = [photo.masks] if isinstance(photo.masks, str) else list(photo.masks.values())
+    masks = list(photo.masks.values()) if isinstance(photo.masks, dict) else [photo.masks]
+    if isinstance(photo.masks, str) and (labelmap := labelmap_beside(photo.masks, dataset.folder)):
+        masks.append(labelmap)
     return facts, [photo.image, *masks, *_object_masks(photo)]
 
 

@@ -2,7 +2,7 @@
 
 Orientation   as displayed: the EXIF orientation is applied.
 Encoding      8- and 16-bit files are sRGB-encoded, float and raw files linear, unless `encoding` is given; primaries
-              are assumed to be Rec. 709.
+              are those of an EXR or HDR's header, else assumed to be Rec. 709.
 Channels      one channel is grey; alpha is dropped.
 Clipped       integer codes from `scanlines.CLIPPED` of the range (254 of 255) on; for a raw file, saturated sensor
               pixels. A float file has no top code; values that are not finite are invalid pixels.

@@ -5,12 +5,15 @@ rows are read in order, in chunks of any height. The size is checked before any 
 one colour takes a thousandth of its size in memory, so a file of a few megabytes can need all memory of a machine.
 
 For the formats of OpenImageIO (JPEG, PNG, TIFF, EXR, HDR), one channel is grey, and repeated; alpha is dropped. Integer
-colours are taken as opened, not premultiplied by alpha; float colours (EXR) are premultiplied by convention.
+colours are taken as opened, not premultiplied by alpha; float colours (EXR) are premultiplied by convention. Float
+colours of other primaries are converted to Rec. 709 without adaptation of white. An EXR has the size of its display
+window.
 """
 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from math import ceil
@@ -27,10 +30,14 @@ from factorlib.reading import one_line
 
 CLIPPED = 0.995  # least share of the white code that is clipped: JPEG compression disturbs the top code a little
 WHITE = {oiio.UINT8: 2**8 - 1, oiio.UINT16: 2**16 - 1, oiio.UINT32: 2**32 - 1}
+REC709 = np.array([[0.64, 0.33], [0.3, 0.6], [0.15, 0.06], [0.3127, 0.329]])  # red, green, blue, white: x, y
+SAME_CHROMATICITY = 1e-3  # primaries that differ by less are the same
+HEADER = 4096  # number of bytes that hold the header of a Radiance file
 COPY = "copy it again from its source"
 log = logging.getLogger("factorlib.images")
 MOST_MEGAPIXELS = 200.0  # twice the number of the largest sensors
 CHANNELS = 4  # greatest number of channels of an ordinary photo
+Rows = Callable[[int, int], Shaped[np.ndarray, "r w 3"]]
 
 
 class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,7 +60,7 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
     profile: str = ""
     white: int | None
     encoding: str
-    rows: Callable[[int, int], Shaped[np.ndarray, "r w 3"]]
+    rows: Rows
     saturated: Callable[[int, int], Bool[np.ndarray, "r w 3"]] | None = None
 
     @property
@@ -112,16 +119,60 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
 
     orientation = spec.get_int_attribute("Orientation", 1)
     white = WHITE.get(spec.format.basetype)
+    size = (spec.height, spec.width) if white else (spec.full_height, spec.full_width)
     return OpenPhoto(
-        width=spec.width,
-        height=spec.height,
+        width=size[1],
+        height=size[0],
         orientation=orientation if 1 <= orientation <= 8 else 1,
         exif={a.name: a.value for a in spec.extra_attribs},
         profile=spec.get_string_attribute("ICCProfile:profile_description"),
         white=white,
         encoding="linear" if white is None else "srgb",
-        rows=rows,
+        rows=rows if white else _in_rec709(_in_display_window(rows, spec), spec, path),
     )
+
+
+def _in_display_window(rows: Rows, spec: oiio.ImageSpec) -> Rows:
+    """Return the reader of rows of an EXR's display window: NaN where its data window does not reach."""
+    down = spec.y - spec.full_y
+    right = spec.x - spec.full_x
+    if (down, right, spec.height, spec.width) == (0, 0, spec.full_height, spec.full_width):
+        return rows
+
+    def displayed(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
+        """Read rows begin … end − 1 of the display window."""
+        result = np.full((end - begin, spec.full_width, 3), np.nan, np.float32)
+        first = min(max(begin - down, 0), spec.height)
+        last = min(max(end - down, first), spec.height)
+        columns = slice(max(-right, 0), max(spec.full_width - right, 0))
+        if last > first and (pixels := rows(first, last)[:, columns]).size:
+            left = max(right, 0)
+            result[first + down - begin : last + down - begin, left : left + pixels.shape[1]] = pixels
+        return result
+
+    return displayed
+
+
+def _in_rec709(rows: Rows, spec: oiio.ImageSpec, path: str | Path) -> Rows:
+    """Return the reader of rows in linear Rec. 709; colours beyond it have negative values.
+
+    Primaries are EXR's attribute `chromaticities`, Radiance's line PRIMARIES, or else Rec. 709's.
+    """
+    with Path(path).open("rb") as stream:
+        line = re.match(rb"#\?[\S\s]*?\nPRIMARIES=([^\n]*)\n", stream.read(HEADER))
+    given = spec.getattribute("chromaticities") or (line[1].split() if line else REC709)
+    primaries = np.array(given, float).reshape(4, 2)
+    if np.abs(primaries - REC709).max() < SAME_CHROMATICITY:
+        return rows
+    matrix = (np.linalg.inv(_xyz_from_rgb(REC709)) @ _xyz_from_rgb(primaries)).astype(np.float32)
+    return lambda begin, end: rows(begin, end).astype(np.float32) @ matrix.T
+
+
+def _xyz_from_rgb(primaries: Shaped[np.ndarray, "4 2"]) -> Shaped[np.ndarray, "3 3"]:
+    """Return the matrix of primaries whose sum is white of luminance 1."""
+    x, y = primaries.T
+    xyz = np.stack([x, y, 1 - x - y]) / y
+    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
 
 
 def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[int]:
@@ -187,7 +238,7 @@ def check_values(path: str | Path, most_megapixels: float = MOST_MEGAPIXELS, key
             oiio.geterror()  # clear the error
         return
     spec = source.spec()
-    millions = spec.width * spec.height * spec.nchannels / 1e6
+    millions = max(spec.width * spec.height, spec.full_width * spec.full_height) * spec.nchannels / 1e6
     source.close()
     if millions > CHANNELS * most_megapixels:
         raise InputError(

@@ -161,13 +161,13 @@ class Block(msgspec.Struct, frozen=True):
             self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
         )
 
-    def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, "n 3"]) -> Block:
-        """Return the same observations with other normals and with a detail of reflectance.
+    def with_detail(self, detail: Float[np.ndarray, "n 3"]) -> Block:
+        """Return the same observations with a detail of reflectance.
 
         The block must have no detail yet.
         """
         bounced = None if self.bounced is None else self.bounced * np.hstack([detail, np.ones_like(detail)])
-        return msgspec.structs.replace(self, normal=normal, detail=detail, bounced=bounced)
+        return msgspec.structs.replace(self, detail=detail, bounced=bounced)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the whitened residuals of a predicted `radiance`, which is in the block's unit.

@@ -157,7 +157,7 @@ def _block(
     )  # fmt: skip
     if observations.detail is None or (observations.detail == 1).all():
         return block
-    return block.on_surface(block.normal, observations.detail.astype(float))
+    return block.with_detail(observations.detail.astype(float))
 
 
 def _rotate_units(

@@ -86,11 +86,13 @@ def observe_texture(
         cosine: Cosine between normal and view.
         positions: b of (1), and the cluster of each pixel.
     """
-    x = diffuse.mean(1)
-    dark = DARK * max(float((diffuse + specular).mean()), 1e-12) if len(x) else 1.0
-    weight = cosine * x**2 / (x**2 + dark**2)
-    ratio = (radiance - specular) / np.maximum(diffuse, 1e-3 * dark)
-    return TextureSamples(positions[0], ratio.clip(0, LARGEST_RATIO), weight, positions[1])
+    dark = DARK * max(float((diffuse + specular).mean()), 1e-12) if len(diffuse) else 1.0
+    weight = diffuse**2 / (diffuse**2 + dark**2)
+    ratio = ((radiance - specular) / np.maximum(diffuse, 1e-3 * dark)).clip(0, LARGEST_RATIO)
+    # z̄, which channels too dark to observe follow
+    mean = (weight * ratio).sum(1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
+    ratio = weight * ratio + (1 - weight) * mean
+    return TextureSamples(positions[0], ratio, cosine * weight.max(1), positions[1])
 
 
 def solve_texture(

@@ -6,16 +6,17 @@ material, two materials in one pixel, no labelled pixel at all.
 
 import logging
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
 from numpy.lib.stride_tricks import sliding_window_view
 
+from factorlib.dataset.paths import labelmap_beside
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError
-from factorlib.labels.mask_files import read_coco, read_inside, read_values
+from factorlib.labels.mask_files import read_coco, read_colours, read_inside, read_values
 
 MUCH = 0.1  # share of an object's pixels that is more than a slip of the brush
 DRAWN_EDGE = 2  # width of the pixels that adjacent outlines may share; they are left out without an error
@@ -44,7 +45,7 @@ def read_labels(
     """Read the labels of one photo.
 
     Args:
-        masks: A label PNG, a COCO json, or {material: PNG}, as in dataset.yaml.
+        masks: A label PNG, a json of COCO or labelme, or {material: PNG}, as in dataset.yaml.
         file: Function from such a name to a path.
         materials: Materials of the dataset, in order.
         size: Height and width of the photo as displayed.
@@ -65,7 +66,11 @@ def read_labels(
         inside = read_coco(mask_file, image, materials, size, key)
         labels = _merged(inside, materials, dict.fromkeys(inside, (mask_file, key)), edge=DRAWN_EDGE)
     else:
-        labels = _labels_of_png(read_values(mask_file, key, size), mask_file, materials, key)
+        folder = mask_file.parents[len(PurePosixPath(masks).parts) - 1]
+        labelmap = labelmap_beside(masks, folder)
+        values = read_colours(mask_file, folder / labelmap, materials, size, key) if labelmap else None
+        values = read_values(mask_file, key, size) if values is None else values
+        labels = _labels_of_png(values, mask_file, materials, key)
     if labels is None or not labels.label.any():
         raise InputError(
             "the mask is empty: no pixel has a material",
@@ -188,13 +193,15 @@ def _merged(
 ) -> Labels | None:
     """Merge several masks into one map; None if there are none.
 
-    Pixels that two masks claim are left out; if they are wider than `edge` pixels, InputError is raised.
+    Pixels that two masks claim are left out; if they are wider than `edge` pixels, InputError is raised. Where outlines
+    are drawn (`edge` > 0), a mask that lies wholly in another is in front of it.
     """
     if not inside:
         return None
     label = np.zeros(next(iter(inside.values())).shape, dtype=np.uint8)
     left_out = label > 0
-    for number, material in ((k, name) for k, name in enumerate(materials, 1) if name in inside):
+    numbers = [(k, name) for k, name in enumerate(materials, 1) if name in inside]
+    for number, material in sorted(numbers, key=lambda each: -int(inside[each[1]].sum()) if edge else 0):
         path, key = sources[material]
         for claimed in np.unique(label[inside[material] & (label > 0)]).tolist():
             shared = inside[material] & (label == claimed)
@@ -202,6 +209,9 @@ def _merged(
             fault = f"materials {materials[claimed - 1]!r} and {material!r} share {int(shared.sum())} pixels"
             fault += f" with {other_path.name}" if other_path != path else ""
             square = (edge + 1, edge + 1)
+            if edge and (shared == inside[material]).all():  # drawn on a larger one, whose outline does not spare it
+                log.warning("%s: %s: %s: %r is in front", path, key, fault, material)
+                continue
             if min(shared.shape) > edge and sliding_window_view(shared, square).all((2, 3)).any():
                 raise InputError(
                     fault, file=path, key=key, cure="a pixel shows one material: erase it from the one behind"

@@ -1,7 +1,10 @@
-"""Readers of mask files: PNG of one channel, and COCO annotations.
+"""Readers of mask files: PNG of one channel, PNG of colours with CVAT's labelmap.txt, COCO and labelme annotations.
 
 Pillow reads PNG, because it alone keeps the stored values: palette indices, not the palette's colours. It stretches
 grey of 2 or 4 bits to 8 bits, which is undone.
+
+The file of labelme becomes COCO's. Label Studio and Roboflow change the names of photos, which is undone. A polygon of
+fewer than three corners is empty.
 
 COCO masks are polygons, and RLE as counts or compressed, by category and file name. pycocotools fills the polygons. It
 needs memory for every pixel of an outline, so the length of outlines is checked first. Run lengths are decoded here:
@@ -9,6 +12,8 @@ pycocotools makes a mask of random memory of runs that are cut short. Several sh
 the number of runs and one picture. The shapes of other photos in the file are left as text.
 """
 
+import logging
+import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -18,8 +23,9 @@ from jaxtyping import Bool, Int, UInt16
 from PIL import Image
 from pycocotools import mask as pycocomask
 
+from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError, did_you_mean
-from factorlib.reading import check_plain, read_bytes, reading
+from factorlib.reading import check_plain, read_bytes, read_text, reading
 
 _STRETCH = {2: 85, 4: 17}  # code of 1 after grey of so many bits is stretched to 8
 _GREY = 0  # PNG colour types
@@ -30,7 +36,11 @@ MOST_BYTES = 512_000_000  # greatest size of a file; a hundred thousand outlines
 LONGEST = 200  # greatest length of an outline, in half perimeters of the photo
 LONGEST_TOGETHER = 5000  # greatest length of all outlines of a photo together
 MOST_DIGITS = 7  # greatest number of 5-bit digits of a compressed run length: no picture has 2**35 pixels
+LARGEST_LABEL = 32  # a PNG with a greater value, except 255, is a soft silhouette
+BACKGROUND = "background"  # CVAT's name of what has no label
+CHANGED = re.compile(r"^[0-9a-f]{8}-|\.rf\.[0-9a-f]{32}\.\w+$")  # what Label Studio and Roboflow add to a name
 CURE = "export the file again"
+log = logging.getLogger("factorlib.labels")
 SIMPLER = "draw outlines with fewer corners, or export the file again"
 
 
@@ -50,38 +60,15 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
     Raises:
         InputError: If the file is not such a PNG, or has another size.
     """
-    check_plain(path, "a PNG", key)
-    with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:
-        check_size(image.size[::-1], size or image.size[::-1], path, key)
-        values = np.asarray(image)
-    with Path(path).open(
-        "rb"
-    ) as stream:  # bit depth and colour type, after signature, IHDR's length and name, and size
-        depth, colour_type = stream.read(26)[24:26]
-    fault = None
-    if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow keeps only the upper byte
-        fault = "has several channels of 16 bits"
-        cure = "save labels in one channel of 8 bits"
-    elif values.ndim == 3:
-        alpha = values[..., -1] if values.shape[-1] in (2, 4) else None
-        colours = values if alpha is None else values[..., :-1]
-        coloured = (colours != colours[..., :1]).any(axis=-1)
-        if coloured.any():
-            fault = f"is a colour picture (one pixel is {tuple(colours[coloured][0].tolist())})"
-            cure = "save labels in one channel: 0 background, k for the k-th material, 255 leave out"
-        elif alpha is not None and (alpha != np.iinfo(alpha.dtype).max).any():
-            fault = "has transparent pixels"
-            cure = "save it without alpha: 0 is background"
-        values = colours[..., 0]
-    if fault:
-        raise InputError(fault, file=path, key=key, cure=cure)
-    return (values // (_STRETCH.get(depth, 1) if colour_type == _GREY else 1)).astype(np.uint16)
+    pixels, depth, colour_type = _decode(path, key, size)
+    return _values(pixels, depth, colour_type, path, key)
 
 
 def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
     """Read a mask of one object or material.
 
-    Inside are the values above half of the greatest one, which suits 0/1, 0/255 and soft edges.
+    Inside are the values above half of the greatest one, which suits 0/1, 0/255 and soft edges. If the picture has
+    transparent pixels, its alpha is the mask.
 
     Args:
         path: File.
@@ -91,11 +78,107 @@ def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None)
     Returns:
         A mask.
     """
-    values = read_values(path, key, size)
-    return values * 2 > values.max() if values.any() else np.zeros(values.shape, dtype=bool)
+    pixels, depth, colour_type = _decode(path, key, size)
+    alpha = _transparency(pixels)
+    values = _values(pixels, depth, colour_type, path, key) if alpha is None else alpha
+    return values > values.max() // 2  # in the values' own type, of which twice the greatest may be no number
 
 
-def check_size(size: Sequence[int], expected: Sequence[int], path: str | Path, key: str) -> None:
+def read_labels_in(path: str | Path, key: str) -> set[int]:
+    """Return the labels in a PNG; none if it is a silhouette: transparency, 0 and 255 alone, or many greys."""
+    pixels, depth, colour_type = _decode(path, key, None)
+    if _transparency(pixels) is not None:
+        return set()
+    values = set(np.unique(_values(pixels, depth, colour_type, path, key)).tolist()) - {0, LEFT_OUT}
+    return set() if max(values, default=0) > LARGEST_LABEL else values
+
+
+def is_cut_out(path: Path, key: str) -> bool:
+    """Return True if a PNG has transparent pixels."""
+    return _transparency(_decode(path, key, None)[0]) is not None
+
+
+def read_colours(
+    path: str | Path, labelmap: Path, materials: list[str], size: tuple[int, int], key: str
+) -> UInt16[np.ndarray, "h w"] | None:
+    """Read the labels of a PNG whose colours a labelmap.txt of CVAT names; None for a grey PNG.
+
+    Args:
+        path: File.
+        labelmap: Lines `name:red,green,blue:…`; `background` is 0.
+        materials: Materials of the dataset, in order.
+        size: Expected height and width.
+        key: Key to name in errors.
+
+    Raises:
+        InputError: If a file is damaged, or a colour or name is unknown.
+    """
+    names = read_labelmap(labelmap)
+    with reading("a PNG", path, key), Image.open(path, formats=["PNG"]) as image:
+        if image.mode not in ("P", "RGB", "RGBA"):
+            return None
+        check_size(image.size[::-1], size, path, key)
+        colours = np.asarray(image.convert("RGB")).astype(np.int64) @ (1 << 16, 1 << 8, 1)
+    labels = np.zeros(size, np.uint16)
+    for colour in np.unique(colours).tolist():
+        name = names.get(colour)
+        if name != BACKGROUND and name not in materials:
+            fault = f"has the colour #{colour:06x}, which {labelmap.name} calls {name!r}: not a material"
+            cure = f"give {labelmap.name} a line for it, with one of {', '.join(materials)}, or {BACKGROUND}"
+            raise InputError(fault, file=path, key=key, cure=cure)
+        labels[colours == colour] = 0 if name == BACKGROUND else materials.index(name) + 1
+    return labels
+
+
+def read_labelmap(path: Path) -> dict[int, str]:
+    """Return the names in a labelmap.txt of CVAT by their colours, 0xRRGGBB."""
+    lines = [line.split(":") for line in read_text(path, "a labelmap", None, MOST_BYTES).splitlines()]
+    with reading("a labelmap", path, cure="its lines are name:red,green,blue::"):
+        rows = [(name, bytes(map(int, colour.split(",")))) for name, colour, *_ in lines if not name.startswith("#")]
+        return {int.from_bytes(colour): name for name, colour in rows}
+
+
+def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> tuple[np.ndarray, int, int]:
+    """Return the pixels of a PNG as Pillow decodes them, its bit depth and its colour type."""
+    check_plain(path, "a PNG", key)
+    with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:
+        check_size(image.size[::-1], size or image.size[::-1], path, key)
+        pixels = np.asarray(image)
+    with Path(path).open(
+        "rb"
+    ) as stream:  # bit depth and colour type, after signature, IHDR's length and name, and size
+        depth, colour_type = stream.read(26)[24:26]
+    return pixels, depth, colour_type
+
+
+def _transparency(pixels: np.ndarray) -> np.ndarray | None:
+    """Return the alpha of a picture, None if it has none, or an opaque one."""
+    alpha = pixels[..., -1] if pixels.ndim == 3 and pixels.shape[-1] in (2, 4) else None
+    return None if alpha is None or (alpha == np.iinfo(alpha.dtype).max).all() else alpha
+
+
+def _values(values: np.ndarray, depth: int, colour_type: int, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
+    """Return the stored values of a decoded PNG; InputError for colours and transparency."""
+    fault = None
+    if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow keeps only the upper byte
+        fault = "has several channels of 16 bits"
+        cure = "save labels in one channel of 8 bits"
+    elif values.ndim == 3:
+        colours = values[..., : 1 if values.shape[-1] == 2 else 3]
+        coloured = (colours != colours[..., :1]).any(axis=-1)
+        if _transparency(values) is not None:
+            fault = "has transparent pixels"
+            cure = "save it without alpha: 0 is background; or, if it shows one material, write masks: {material: file}"
+        elif coloured.any():
+            fault = f"is a colour picture (one pixel is {tuple(colours[coloured][0].tolist())})"
+            cure = "save labels in one channel: 0 background, k for the k-th material, 255 leave out"
+        values = colours[..., 0]
+    if fault:
+        raise InputError(fault, file=path, key=key, cure=cure)
+    return (values // (_STRETCH.get(depth, 1) if colour_type == _GREY else 1)).astype(np.uint16)
+
+
+def check_size(size: Sequence[float], expected: Sequence[int], path: str | Path, key: str) -> None:
     """Check a size (height, width) against the photo's; the error says so if the mask is rotated by 90°.
 
     Args:
@@ -112,7 +195,7 @@ def check_size(size: Sequence[int], expected: Sequence[int], path: str | Path, k
         if tuple(size) == tuple(expected)[::-1]:
             cure = "it lies on its side: the photo's EXIF orientation is applied, so mask the photo as it is displayed"
         raise InputError(
-            f"the mask is {size[1]} × {size[0]} pixels, the photo {expected[1]} × {expected[0]}",
+            f"the mask is {size[1]:g} × {size[0]:g} pixels, the photo {expected[1]} × {expected[0]}",
             file=path,
             key=key,
             cure=cure,
@@ -147,8 +230,8 @@ class CocoImage(msgspec.Struct, frozen=True):
 
     id: int | str
     file_name: str
-    width: int | None = None
-    height: int | None = None
+    width: float | None = None
+    height: float | None = None
 
 
 class Coco(msgspec.Struct, frozen=True):
@@ -157,6 +240,53 @@ class Coco(msgspec.Struct, frozen=True):
     images: list[CocoImage]
     annotations: list[Annotation]
     categories: list[Category]
+
+
+class LabelmeShape(msgspec.Struct, frozen=True):
+    """Shape of labelme: corners of a polygon, or opposite corners of a rectangle."""
+
+    label: str
+    points: list[tuple[float, float]]
+    shape_type: str = "polygon"
+
+
+class Labelme(msgspec.Struct, frozen=True):
+    """Contents of a file of labelme that are read: the shapes of one photo."""
+
+    shapes: list[LabelmeShape]
+    imageHeight: float | None = None
+    imageWidth: float | None = None
+
+
+def read_annotations(path: str | Path, image: str = "", key: str | None = None) -> Coco:
+    """Read a file of COCO, or one of labelme as COCO's; InputError if it is neither.
+
+    Args:
+        path: File.
+        image: File name of the photo, to which the shapes of labelme belong.
+        key: Key to name in errors.
+    """
+    content = read_bytes(path, "COCO", key, MOST_BYTES)
+    with reading("COCO", path, key, "it needs images, annotations and categories; or shapes, as labelme's has"):
+        try:
+            labelme = msgspec.json.decode(content, type=Labelme)
+        except msgspec.ValidationError:
+            return msgspec.json.decode(content, type=Coco)
+        images = [CocoImage(0, image, labelme.imageWidth, labelme.imageHeight)]
+        names = dict.fromkeys(shape.label for shape in labelme.shapes)
+        annotations = [Annotation(0, shape.label, msgspec.Raw(_segmentation(shape))) for shape in labelme.shapes]
+        return Coco(images, annotations, [Category(name, name) for name in names])
+
+
+def _segmentation(shape: LabelmeShape) -> bytes:
+    """Return COCO's text of a shape; null for one that is neither a polygon nor a rectangle."""
+    points = np.array(shape.points)
+    if shape.shape_type == "rectangle":
+        (left, top), (right, bottom) = points.tolist()
+        points = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+    elif shape.shape_type != "polygon":
+        return b"null"
+    return msgspec.json.encode([points.ravel().tolist()])
 
 
 def read_coco(
@@ -173,11 +303,10 @@ def read_coco(
         size: Height and width of the photo.
         key: Key to name in errors.
     """
-    content = read_bytes(path, "COCO", key, MOST_BYTES)
-    with reading("COCO", path, key, "it needs images, annotations and categories"):
-        coco = msgspec.json.decode(content, type=Coco)
+    coco = read_annotations(path, image, key)
     entry = _entry(coco, image, path)
-    check_size((entry.height or size[0], entry.width or size[1]), size, path, key)
+    with reading("COCO", path, key, CURE):
+        _check_stated_size(coco, entry, size, path, key)
     names = {category.id: category.name for category in coco.categories}
     segmentations: dict[str, list[tuple[str, msgspec.Raw]]] = {}  # by material, with their keys
     for index, annotation in enumerate(coco.annotations):
@@ -205,6 +334,18 @@ def read_coco(
                 raise InputError(fault, file=path, key=place, cure=SIMPLER)
         masks[name] = _union(shapes, size, path)
     return masks
+
+
+def _check_stated_size(coco: Coco, entry: CocoImage, size: tuple[int, int], path: str | Path, key: str) -> None:
+    """Check the size that a file states; that of a photo on its side may be the stored one, which an outline leaves."""
+    height = entry.height or size[0]
+    width = entry.width or size[1]
+    if (height, width) == size[::-1] != size:
+        shapes = [bytes(shape.segmentation) for shape in coco.annotations if shape.image_id == entry.id]
+        outlines = [outline for text in shapes if text[:1] == b"[" for outline in msgspec.json.decode(text)]
+        if any(max(each[::2], default=0) > width or max(each[1::2], default=0) > height for each in outlines):
+            return
+    check_size((height, width), size, path, key)
 
 
 def _union(
@@ -257,6 +398,8 @@ def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
     bases = [PurePosixPath(entry.file_name.replace("\\", "/")).name for entry in coco.images]
     entries = [entry for entry in coco.images if PurePosixPath(entry.file_name) == PurePosixPath(image)]
     entries = entries or [entry for entry, name in zip(coco.images, bases) if name == base]
+    plain = base.replace(".", "_")  # Roboflow's kitchen_jpg.rf.<digits>.jpg
+    entries = entries or [entry for entry, name in zip(coco.images, bases) if CHANGED.sub("", name) in (base, plain)]
     if not entries:
         raise InputError(
             f"the COCO file has no image {base!r}", file=path, key="images", cure=did_you_mean(base, bases)
@@ -294,8 +437,11 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
     for index, polygon in enumerate(segmentation):
         fault = ""
         corners = np.array(polygon)
+        if len(corners) in (0, 2, 4):
+            log.warning("%s: %s[%d]: fewer than three corners: it counts as empty", path, key, index)
+            continue
         cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
-        if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
+        if len(corners) % 2 or not np.isfinite(corners).all():
             fault = "is not a polygon"
         elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
             fault = f"has corners outside the image of {_wh(shape)} pixels"
@@ -310,7 +456,8 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
             raise InputError(fault, file=path, key=f"{key}[{index}]", cure=cure)
         polygons.append(corners.ravel().tolist())
         length += longer
-    return [each["counts"].decode("ascii") for each in pycocomask.frPyObjects(polygons, *shape)], length
+    runs = pycocomask.frPyObjects(polygons, *shape) if polygons else []
+    return [each["counts"].decode("ascii") for each in runs], length
 
 
 def _wh(shape: tuple[int, int]) -> str:

@@ -1,6 +1,6 @@
 """Small reader of Wavefront OBJ that keeps names which general readers drop: `g`, `o`, and `usemtl` without a .mtl.
 
-It reads v, vn, f (polygons as fans, negative indices, `v/vt/vn` in all its forms), g, o, usemtl, and continued lines.
+It reads v, vn, f (polygons, negative indices, `v/vt/vn` in all its forms), g, o, usemtl, and continued lines.
 It never opens the .mtl: a part's name is in the OBJ itself.
 """
 
@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from factorlib.errors import InputError
-from factorlib.meshes.triangle_soup import Limits, TriangleSoup, quoted, text_lines
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, quoted, text_lines, triangulate
 
 MOST = 2**31  # greatest index in any file
 COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles
+NAMED = re.compile(r"\s*(usemtl|g|o)\s")
 CONTINUED = re.compile(rb"\\(\r\n|\r|\n|\Z)")  # line that continues in the next
 
 
@@ -23,8 +24,9 @@ class _Tables:
 
     def __init__(self) -> None:
         self.coordinates = {"v": array("d"), "vn": array("d")}
-        self.faces = array("q")  # indices from 0; −1 for no normal
-        self.face_normals = array("q")
+        self.corners = array("q")  # vertices of all faces, and their normals; indices from 0, −1 for no normal
+        self.corner_normals = array("q")
+        self.sizes = array("q")  # numbers of corners of the faces
         self.part = array("q")
         self.parts: dict[tuple[str, ...], int] = {}
         self.names: dict[str, tuple[str, ...]] = {"usemtl": (), "g": (), "o": ()}  # names of the faces that follow
@@ -47,20 +49,26 @@ class _Tables:
         if len(corners) < 3:
             raise ValueError("a face needs at least three corners")
         names = tuple(dict.fromkeys(name for kind in self.names.values() for name in kind if name))
-        part = self.parts.setdefault(names, len(self.parts))
-        for second, third in zip(corners[1:], corners[2:]):
-            self.faces.extend((corners[0][0], second[0], third[0]))
-            self.face_normals.extend((corners[0][1], second[1], third[1]))
-            self.part.append(part)
+        self.part.append(self.parts.setdefault(names, len(self.parts)))
+        self.sizes.append(len(corners))
+        self.corners.extend([vertex for vertex, _ in corners])
+        self.corner_normals.extend([normal for _, normal in corners])
+
+    def check(self, limits: Limits, path: Path) -> None:
+        """Check the numbers of vertices and triangles."""
+        limits.check(len(self.coordinates["v"]) // 3, len(self.corners) - 2 * len(self.sizes), path)
 
     def soup(self) -> TriangleSoup:
         """Return the triangles of the whole file."""
         normals = np.concatenate([np.array(self.coordinates["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
-        index = np.array(self.face_normals, dtype=np.int64).reshape(-1, 3)
+        index = np.array(self.corner_normals, dtype=np.int64)
         index[(index < 0) | (index >= len(normals))] = len(normals) - 1
         vertices = np.array(self.coordinates["v"], dtype=float).reshape(-1, 3)
-        triangles = np.array(self.faces, dtype=np.int64).reshape(-1, 3)
-        return TriangleSoup(vertices, triangles, np.array(self.part, dtype=np.int64), list(self.parts), normals[index])
+        corners = np.array(self.corners, dtype=np.int64)
+        sizes = np.array(self.sizes, dtype=np.int64)
+        triangles = triangulate(vertices, sizes, corners)
+        part = np.repeat(np.array(self.part, dtype=np.int64), sizes - 2)
+        return TriangleSoup(vertices, corners[triangles], part, list(self.parts), normals[index[triangles]])
 
 
 def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
@@ -78,7 +86,8 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     number = 0
     for count, line in enumerate(text_lines(CONTINUED.sub(b"\v", content) if b"\\" in content else content)):
         number += 1 + line.count("\v")
-        key, *words = line.split("#", 1)[0].split() or [""]
+        comment = r"\s#(?!\S)" if NAMED.match(line) else "#"  # `usemtl Material #1` is a name
+        key, *words = re.split(comment, line, maxsplit=1)[0].split() or [""]
         try:
             tables.read_line(key, words)
         except (ValueError, IndexError, OverflowError) as error:
@@ -88,8 +97,8 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
                 cure="correct the line, or export the mesh again, as OBJ",
             ) from error
         if count % COUNTED_EVERY == 0:
-            limits.check(len(tables.coordinates["v"]) // 3, len(tables.part), path)
-    limits.check(len(tables.coordinates["v"]) // 3, len(tables.part), path)
+            tables.check(limits, path)
+    tables.check(limits, path)
     return tables.soup()
 
 

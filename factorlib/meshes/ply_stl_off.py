@@ -1,17 +1,10 @@
 """Readers of mesh files of one part: PLY, STL (binary and text) and OFF; and a deterministic writer of binary PLY.
 
-PLY is read here, because its lists may differ in length, which trimesh refuses. The numbers of a text file are read as
-rows of float64, so that one reader serves text and both byte orders. Nothing is allocated that the file has no room
-for.
-
-trimesh reads STL and OFF. It reads a truncated text file as a smaller mesh, so the numbers of corners and faces are
-compared with the file's. It is imported on first use, which takes a third of a second.
+PLY is read here, because its lists may differ in length, which trimesh refuses. A row of a text file is a line; numbers
+behind those of the header, which MeshLab writes, are ignored. Nothing is allocated that the file has no room for.
 """
 
-import io
 import re
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +14,12 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.triangle_soup import (
     Limits,
     TriangleSoup,
-    fans,
     floats,
     parse_numbers,
     quoted,
     single_part_soup,
     text_lines,
+    triangulate,
 )
 from factorlib.wholefile import write_bytes
 
@@ -49,8 +42,11 @@ CORNERS = ("vertex_indices", "vertex_index")
 
 
 Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, and of the length before a list of them
+Elements = dict[str, tuple[int, Properties]]  # number of rows and their properties
 Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # numbers of all rows, concatenated, and the count of each row
-VERTEX = re.compile(rb"^[ \t]*vertex\b", re.MULTILINE | re.IGNORECASE)
+STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE | re.IGNORECASE)
+END_FACET = re.compile(rb"^[ \t]*endfacet\b", re.MULTILINE | re.IGNORECASE)
 COUNTS = re.compile(r"(?:(?:ST)?C?N?OFF)?\s*([0-9]+)\s+([0-9]+)[^\n]*")  # OFF itself is optional
 CURE = "the file may be incomplete, or of another format than its suffix: copy or export it again"
 
@@ -72,24 +68,36 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     order, elements, start = _header(path, content)
     counts = {name: count for name, (count, _) in elements.items()}
     limits.check(counts.get("vertex", 0), counts.get("face", 0), path)
-    content, offset, columns = (content, start, {}) if order else (parse_numbers(content[start:]).tobytes(), 0, {})
-    for name, (count, properties) in elements.items():
-        columns[name], offset = _columns(content, offset, order, count, properties)
+    columns = {} if order else _text_columns(content[start:], elements)
+    for name, (count, properties) in elements.items() if order else ():
+        columns[name], start = _columns(content, start, order, count, properties)
     # corners of the faces: the list of a known name, or the only one
     faces = columns.get("face", {})
     corner_property = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
     values, sizes = faces[corner_property] if corner_property else (np.empty(0), np.zeros(0, np.int64))
-    limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
-    whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
-    if not whole or ((corners := values.astype(np.int64)) != values).any():
-        raise InputError("a face has a vertex index that is not a whole number", file=path, cure=CURE)
     numbers = {name: floats(column) for name, (column, each) in columns.get("vertex", {}).items() if (each == 1).all()}
     if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
     points = np.stack([numbers[n] for n in "xyz"], axis=1)
     normal_names = "nx", "ny", "nz"
     normals = np.stack([numbers[n] for n in normal_names], axis=1) if set(normal_names) <= numbers.keys() else None
-    return single_part_soup(points, fans(sizes, corners), path.stem, normals)
+    return _polygon_soup(points, values, sizes, path, limits, normals)
+
+
+def _polygon_soup(
+    points: np.ndarray,
+    values: np.ndarray,
+    sizes: np.ndarray,
+    path: Path,
+    limits: Limits,
+    normals: np.ndarray | None = None,
+) -> TriangleSoup:
+    """Return the triangles of polygons with vertex indices `values`, all in a row; InputError for a bad index."""
+    limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
+    whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
+    if not whole or ((corners := values.astype(np.int64)) != values).any():
+        raise InputError("a face has a vertex index that is not a whole number", file=path, cure=CURE)
+    return single_part_soup(points, corners[triangulate(points, sizes, corners)], path.stem, normals)
 
 
 def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Properties]], int]:
@@ -154,15 +162,42 @@ def _check_room(elements: dict[str, tuple[int, Properties]], order: str, room: i
         )
 
 
+def _text_columns(text: bytes, elements: Elements) -> dict[str, Columns]:
+    """Return the columns of each element of a text file; ValueError for a row that ends early, or a bad length."""
+    numbers = np.append(parse_numbers(text), 0)  # the last stands behind all rows
+    lengths = np.array([words for line in text_lines(text) if (words := len(line.split()))], np.int64)
+    starts = np.append(0, np.cumsum(lengths))
+    columns: dict[str, Columns] = {}
+    for name, (count, properties) in elements.items():
+        place = starts[:count]
+        ends = starts[1 : count + 1]
+        if len(ends) < count:
+            raise ValueError("the file ends in the middle of its rows")
+        columns[name] = {}
+        for each, (_, length) in properties.items():
+            sizes = np.ones(count, np.int64)
+            if length:
+                sizes = numbers[place].astype(np.int64)
+                if (sizes < 0).any() or (sizes != numbers[place]).any():
+                    raise ValueError("the length of a list is not a whole number of at least 0")
+                place = place + 1
+            if (sizes > ends - place).any():
+                raise ValueError("a row has fewer numbers than the header says")
+            first = np.repeat(place - np.cumsum(sizes) + sizes, sizes)
+            columns[name][each] = numbers[first + np.arange(len(first))], sizes
+            place = place + sizes
+        starts = starts[count:]
+    return columns
+
+
 def _columns(content: bytes, offset: int, order: str, count: int, properties: Properties) -> tuple[Columns, int]:
     """Return the columns of an element's rows, and the offset of their end.
 
-    Consecutive rows with lists of equal lengths are read together. `order` is the byte order; "" means that every
-    number is a float64. ValueError is raised if the file ends early or a list has no valid length.
+    Consecutive rows with lists of equal lengths are read together. `order` is the byte order. ValueError is raised if
+    the file ends early or a list has no valid length.
     """
     kinds = [
-        (np.dtype(order + kind if order else "f8"), np.dtype(order + length if order else "f8") if length else None)
-        for kind, length in properties.values()
+        (np.dtype(order + kind), np.dtype(order + length) if length else None) for kind, length in properties.values()
     ]
     pieces = [([np.empty(0)], [np.zeros(0, np.int64)]) for _ in kinds]
     row = 0
@@ -176,10 +211,10 @@ def _columns(content: bytes, offset: int, order: str, count: int, properties: Pr
             if counter:
                 fields.append((f"n{number}", counter, ()))
                 length = np.frombuffer(content, counter, 1, place)[0].item()
-                if length < 0 or length != int(length):
-                    raise ValueError(f"a list has the length {length}, which must be a whole number of at least 0")
+                if length < 0:
+                    raise ValueError(f"a list has the length {length}, which must be at least 0")
                 place += counter.itemsize
-            lengths.append(int(length) if counter else 1)
+            lengths.append(length if counter else 1)
             fields.append((f"v{number}", kind, (lengths[-1],)))
             place += lengths[-1] * kind.itemsize
             if place > len(content):
@@ -240,35 +275,26 @@ def read_stl(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     Raises:
         InputError: If the file is malformed or too large.
     """
-    from trimesh.exchange.stl import load_stl
-
     binary_size = 84 + 50 * int.from_bytes(content[80:84], "little")
-    is_binary = len(content) == binary_size
-    mesh = _loaded(load_stl, content if is_binary else content.decode("ascii", "replace").encode())
-    solids = list(mesh["geometry"].values()) if "geometry" in mesh else [mesh]
-    corners = np.concatenate([np.empty((0, 3)), *(floats(solid["vertices"]) for solid in solids)])
+    if len(content) == binary_size:
+        corners = np.frombuffer(content, STL_ROW, offset=84)["corners"].reshape(-1, 3)
+    else:
+        corners = parse_numbers(b" ".join(VERTEX.findall(content))).reshape(-1, 3)
+        facets = len(END_FACET.findall(content))
+        if not 0 < len(corners) == 3 * facets:
+            fault = f"is neither a whole text STL ({len(corners)} corners of {facets} facets) "
+            fault += f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
+            raise InputError(fault, file=path, cure=CURE)
     limits.check(len(corners), len(corners) // 3, path)
-    expected = len(VERTEX.findall(content))
-    if not is_binary and not 0 < len(corners) == expected:
-        raise InputError(
-            (
-                f"is neither a whole text STL ({len(corners)} of {expected} corners can be read) "
-                f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
-            ),
-            file=path,
-            cure=CURE,
-        )
     return single_part_soup(corners, np.arange(len(corners)), path.stem)
 
 
 def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
-    """Read an OFF file; polygons become fans of triangles.
+    """Read an OFF file; polygons are triangulated.
 
     Raises:
         InputError: If the file is malformed or too large.
     """
-    from trimesh.exchange.off import load_off
-
     lines = [line for line in (line.split("#", 1)[0].strip() for line in text_lines(content)) if line]
     counts = COUNTS.match("\n".join(lines[:2]))
     if counts is None:
@@ -279,23 +305,9 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
         )
     vertices = int(counts[1])
     faces = int(counts[2])
-    rows = lines[counts[0].count("\n") + 1 :]
-    polygons = rows[vertices : vertices + faces]
-    triangles = sum(int(polygon.split()[0]) - 2 for polygon in polygons)
-    limits.check(vertices, triangles, path)
-    mesh = _loaded(load_off, "\n".join([f"OFF\n{vertices} {faces} 0", *rows]).encode())
-    if len(polygons) != faces or len(mesh["faces"]) != triangles:
-        raise InputError(
-            f"announces {vertices} vertices and {faces} faces, but has fewer or incomplete ones", file=path, cure=CURE
-        )
-    return single_part_soup(mesh["vertices"], mesh["faces"], path.stem)
-
-
-def _loaded(load: Callable[[io.BytesIO], dict], content: bytes) -> dict:
-    """Call a reader of trimesh; ValueError for text that is not a number, of which NumPy only warns."""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            return load(io.BytesIO(content))
-        except DeprecationWarning:
-            raise ValueError("a word in it is not a number") from None
+    limits.check(vertices, faces, path)
+    rows = "\n".join(lines[counts[0].count("\n") + 1 :]).encode()
+    polygon: Properties = {"corners": ("f8", "f8")}
+    columns = _text_columns(rows, {"vertex": (vertices, dict.fromkeys("xyz", ("f8", None))), "face": (faces, polygon)})
+    points = np.stack([columns["vertex"][axis][0] for axis in "xyz"], axis=1)
+    return _polygon_soup(points, *columns["face"]["corners"], path, limits)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.errors import InputError
+from factorlib.meshes.mesh import area_vectors
 
 VERTICES_A_TRIANGLE = 3
 MOST_PARTS = 100_000  # greatest number of parts of one file
@@ -22,6 +23,8 @@ LARGEST = 1e15  # greatest coordinate: its cube, and its ratio to any plausible 
 LEAST_EXTENT = 1e-12  # least extent
 LEAST_SHARE = 1e-9  # least extent over distance from the origin: below, too few digits are left for the shape
 QUOTED = 80  # number of characters of a line in a message
+FLAT = 1e-9  # least turn of a fan's triangle against its polygon, in areas of the polygon
+MOST_CORNERS = 1000  # greatest number of corners of a concave polygon; clipping the ears of a spiral takes seconds
 LONGEST = 2_000_000  # number of characters of a line; each of its words becomes an object
 
 
@@ -128,18 +131,74 @@ def normals_at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray,
     return np.concatenate([floats(normals), np.full((1, 3), np.nan)])[np.where(exists, faces, len(normals))]
 
 
-def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[np.ndarray, "f 3"]:
-    """Triangulate polygons, each as a fan about its first corner; polygons of fewer than three corners give none.
+def triangulate(
+    vertices: Float[np.ndarray, "v 3"], sizes: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]
+) -> Int[np.ndarray, "f 3"]:
+    """Triangulate polygons: each as a fan about its first corner or, if that leaves the polygon, by clipping ears.
 
-    `counts` are the numbers of corners of the polygons, `corners` those of all polygons in a row.
+    Polygons of fewer than three corners give no triangle.
 
-    >>> fans(np.array([3, 2, 4]), np.array([7, 8, 9, 1, 2, 3, 4, 5, 6])).tolist()
-    [[7, 8, 9], [3, 4, 5], [3, 5, 6]]
+    Args:
+        vertices: Vertices; an index out of range may be in `corners`, and is reported later.
+        sizes: Numbers of corners of the polygons.
+        corners: Indices of the vertices of all polygons in a row.
+
+    Returns:
+        Triangles, as positions in `corners`.
+
+    Raises:
+        ValueError: If a polygon that needs its ears clipped has more than MOST_CORNERS corners.
+
+    >>> square = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 0]])
+    >>> triangulate(square, np.array([3, 2, 4]), np.array([2, 3, 4, 1, 2, 0, 1, 2, 3])).tolist()
+    [[0, 1, 2], [5, 6, 7], [5, 7, 8]]
     """
-    triangles = np.maximum(counts - 2, 0)
-    first = np.repeat(np.cumsum(counts) - counts, triangles)
-    within = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1).astype(np.int64)
+    counts = np.maximum(sizes - 2, 0)
+    ends = np.cumsum(counts)
+    polygon = np.repeat(np.arange(len(sizes)), counts)
+    first = (np.cumsum(sizes) - sizes)[polygon]
+    second = first + np.arange(len(polygon)) - (ends - counts)[polygon] + 1
+    triangles = np.stack([first, second, second + 1], axis=1).astype(np.int64)
+    if len(vertices) == 0 or (counts < 2).all():
+        return triangles
+    with np.errstate(all="ignore"):  # vertices that are not finite are refused later
+        points = vertices[np.clip(corners, 0, len(vertices) - 1).astype(np.int64)]
+        area = area_vectors(points, triangles)
+        # normal of a polygon: the sum of its fan's area vectors (Newell); a concave one has a triangle against it
+        normal = np.stack([np.bincount(polygon, axis, len(sizes)) for axis in area.T], axis=1)
+        against = (area * normal[polygon]).sum(axis=1) < -FLAT * np.square(normal).sum(axis=1)[polygon]
+    for concave in np.unique(polygon[against]).tolist():
+        if sizes[concave] > MOST_CORNERS:
+            raise ValueError(f"a concave polygon has {sizes[concave]:,} corners; at most {MOST_CORNERS:,} are read")
+        rows = slice(ends[concave] - counts[concave], ends[concave])
+        start = triangles[rows.start, 0]
+        triangles[rows] = start + _clip_ears(points[start : start + sizes[concave]], normal[concave])
+    return triangles
+
+
+def _clip_ears(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, " 3"]) -> Int[np.ndarray, "t 3"]:
+    """Triangulate a simple polygon about a normal: cut off triangles of neighbours that hold no corner."""
+    left = np.arange(len(points))
+    least = FLAT * normal @ normal
+    triangles = []
+    ear = 0
+    while len(left) > 3:
+        ears = np.stack([np.roll(left, 1), left, np.roll(left, -1)])
+        area = area_vectors(points, ears.T) @ normal
+        order = (np.arange(len(left)) + ear + 1) % len(left)  # not beside the last ear, which would make a thin one
+        reflex = left[area <= least]
+        for ear in order[area[order] > least]:
+            # a corner lies in the triangle if it is outside no edge, and none of its corners
+            inside = ~(points[reflex, None] == points[ears[:, ear]]).all(axis=2).any(axis=1)
+            for edge in zip(ears[:, ear], np.roll(ears[:, ear], -1)):
+                inside &= area_vectors(points, np.stack(np.broadcast_arrays(*edge, reflex), 1)) @ normal > -least
+            if not inside.any():
+                break
+        else:
+            ear = order[0]  # the polygon crosses itself, or is flat
+        triangles.append(ears[:, ear])
+        left = np.delete(left, ear)
+    return np.stack([*triangles, left])
 
 
 def check_soup(soup: TriangleSoup, file: str | Path) -> TriangleSoup:

@@ -19,17 +19,20 @@ class DetailEvidence(msgspec.Struct, frozen=True):
         held_out_loss_without: loss of their held-out observations without it
         margin: difference of the logarithms, in standard errors
         stiffness: stiffness of the refinement, the best of the values that were tried
+        log_bayes_factor: logarithm of the Bayes factor of these photos, where it decides
     """
 
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
     margin: float | None = None
     stiffness: float | None = None
+    log_bayes_factor: float | None = None
 
     @classmethod
     def from_decision(cls, evidence: Any, stiffness: float | None) -> "DetailEvidence":
         """Convert the solver's decision and the chosen stiffness."""
-        return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
+        losses = evidence.held_out_loss_with, evidence.held_out_loss_without
+        return cls(*losses, evidence.margin, stiffness, evidence.log_bayes_factor)
 
 
 class SurfaceTable(msgspec.Struct, frozen=True):
@@ -38,22 +41,16 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     Attributes:
         moved: True if surfaces differ from the given meshes
         moved_by: evidence for it
-        painted: True if diffuse reflectance has detail, beyond what moved surfaces explain
-        painted_by: evidence for it
         gains: by photo: decrease of minus twice the log marginal likelihood of its observations, without a part in the
             surface
         displacements: by mesh: along the normal at each node of the subdivided mesh (`meshes.subdivision`), in
             units of the mesh's extent
-        log_factors: by mesh: log factor on diffuse reflectance at each node, per channel
     """
 
     moved: bool = False
     moved_by: DetailEvidence = DetailEvidence()
-    painted: bool = False
-    painted_by: DetailEvidence = DetailEvidence()
     gains: dict[str, float] = {}
     displacements: dict[str, list[float]] = {}
-    log_factors: dict[str, list[tuple[float, float, float]]] = {}
 
 
 def read_surface(folder: str | Path | None) -> SurfaceTable:

@@ -8,6 +8,7 @@ import shlex
 import signal
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -165,11 +166,17 @@ class Project(msgspec.Struct, frozen=True):
         raise InputError(f"there is no dataset {name!r}", key="DATASET", cure=cure)
 
     def find_dataset(self, name: str) -> Path | None:
-        """Return the folder of a dataset, None if there is none; InputError for an impossible name or path."""
-        by_name = "/" not in name or name.rstrip("/") in ("", ".", "..")
-        if by_name:
+        """Return the folder of a dataset, None if there is none; InputError for an impossible name or path.
+
+        A name is that of a folder in data/, of one here, or of results, which name the folder of their dataset.
+        """
+        paths = [Path(os.path.abspath(name))]
+        if "/" not in name or name.rstrip("/") in ("", ".", ".."):
             check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
-        for path in ([self.root / "data" / name] if by_name else []) + [Path(os.path.abspath(name))]:
+            paths.insert(0, self.root / "data" / name)
+            with suppress(OSError):  # build/<name>/dataset.txt
+                paths.append(self.root / os.fsdecode((self.build / name / "dataset.txt").read_bytes().strip() or name))
+        for path in paths:
             if os.path.exists(path):
                 folder = path if os.path.isdir(path) else path.parent
                 check_name(folder.name, "a dataset", file=folder, key="DATASET", reserved=RESERVED)

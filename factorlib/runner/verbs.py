@@ -278,8 +278,8 @@ def begin(
         print(f"  no contact sheet: {fault}")
     if auto and not missing:
         return validate(project, dataset, [])
-    label = f"name your materials in it, then {project.command('label', dataset)}, then "
-    first = label * any("`make label`" in line for line in missing)
+    drawn = f"name your materials in it, then {project.command('label', dataset)}, then "
+    first = drawn if any("make label" in line for line in missing) else ""
     print(f"next: {first}{project.command('validate', dataset)}")
     return 0
 

@@ -1,5 +1,6 @@
 """Poses from masks and keypoints against rendered truth, what masks say of objects, and which part of a mesh is which label."""
 
+import msgspec
 import numpy as np
 import pytest
 import trimesh
@@ -104,6 +105,14 @@ def test_too_few_pixels_a_mask_of_the_whole_photo_and_a_mirrored_one_are_doubted
     assert answered(chair(), mask=lambda s: Silhouette(np.ones_like(s.label)), known=False, **SMALL)[1]
     mirrored = answered(chair(), mask=lambda s: Silhouette(np.ascontiguousarray(s.label[:, ::-1])), known=False)
     assert any("mirror" in reason for reason in mirrored[1]) and not answered(chair(), known=False)[1]
+
+
+def test_a_body_that_is_its_own_mirror_image_is_not_called_mirrored_where_its_pose_was_missed():
+    caster, camera, pose = photo_of(mesh_of([trimesh.creation.cylinder(0.5, 1.3)]), 4, **SMALL)
+    obj = ObjectToAlign("can", caster, true_silhouette(caster, camera, pose))
+    result = align_photo([obj], camera, KnownFocal(camera.focal, "dataset"), "photo", BRIEF)
+    missed = msgspec.structs.replace(result.estimates[0], score=0.9)
+    assert measure_reliability(obj, msgspec.structs.replace(result, estimates=[missed]), 0).mirrored_score is None
 
 
 TIPS = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0], [0.4, 0.4, -0.95], [-0.4, -0.4, -0.95], [0.4, -0.4, -0.95]])  # fmt: skip

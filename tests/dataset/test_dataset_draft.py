@@ -9,7 +9,9 @@ import pytest
 from PIL import Image
 
 from factorlib.dataset.read_dataset import read_dataset
+from factorlib.dataset.slices import dataset_slice
 from factorlib.dataset_draft import new_dataset
+from factorlib.labels.label_image import read_labels
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
 from tests.align.test_align import LAMP, TWINS, silhouette_of
@@ -59,6 +61,42 @@ def test_labels_become_materials_parts_are_left_open_and_a_further_mask_is_the_s
     assert spec["photos"][1]["objects"] == objects
     assert spec["photos"][0]["objects"] == [{"name": "chair", "mesh": "chair"}]
     refusal(r"\?", read_dataset, folder / "data" / "mine")
+
+
+@pytest.mark.parametrize("kind", ["soft", "255", "transparent", "photo"])
+def test_a_mask_without_labels_is_the_silhouette_of_one_material_and_that_is_said(folder, kind):
+    grey = np.linspace(0, 255, 80).astype(np.uint8).reshape(8, 10)
+    grey = {"255": np.where(grey > 127, 255, 0).astype(np.uint8)}.get(kind, grey)
+    pixels = np.dstack([grey[::-1]] * 3 + [grey]) if kind in ("transparent", "photo") else grey
+    for photo in ("kitchen", "IMG 0412"):
+        Image.fromarray(pixels).save(folder / ("photos" if kind == "photo" else "masks") / f"{photo}.png")
+    (folder / "photos" / "kitchen.jpg").unlink(missing_ok=kind != "photo")
+    if kind != "photo":
+        Image.fromarray(pixels).convert("RGB").save(folder / "photos" / "kitchen.jpg")
+    missing, spec = made(folder, masks=None if kind == "photo" else "masks")
+    assert spec["materials"] == ["label_1"] and all(
+        "cut at half, it is the silhouette of label_1" in line for line in missing
+    )
+    dataset = read_dataset(folder / "data" / "mine")
+    inside = read_labels(dataset.photo("kitchen").masks, lambda name: dataset.folder / name, ["label_1"], (8, 10), "")
+    assert np.array_equal(inside.label, grey > 127)
+
+
+def test_masks_of_labelme_and_of_cvat_are_copied_and_name_the_materials(folder):
+    for photo in ("kitchen", "IMG 0412"):
+        shapes = [{"label": name, "points": [[1, 1], [5, 1], [5, 5]]} for name in ("shell", "legs")]
+        (folder / "masks" / f"{photo}.json").write_text(json.dumps({"shapes": shapes}))
+    _, spec = made(folder)
+    assert spec["materials"] == ["shell", "legs"] and spec["photos"][1]["masks"] == "masks/kitchen.json"
+    shutil.rmtree(folder / "data")
+    shutil.rmtree(folder / "masks")
+    masks(folder, SegmentationClass__kitchen=[0], SegmentationClass__IMG_0412=[0], SegmentationObject__kitchen=[0])
+    (folder / "masks" / "labelmap.txt").write_text("background:0,0,0::\nshell:9,0,0::\nlegs:0,9,0::\n")
+    _, spec = made(folder)
+    assert spec["materials"] == ["shell", "legs"]
+    assert spec["photos"][1]["masks"] == "masks/SegmentationClass/kitchen.png"
+    file = dataset_slice(read_dataset(folder / "data" / "mine"), "photo", "kitchen").files
+    assert "masks/labelmap.txt" in file
 
 
 def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder):

@@ -4,17 +4,19 @@ import json
 import math
 import re
 
+import msgspec
 import numpy as np
 import pycolmap
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.input_checks import convert_intrinsics
+from factorlib.align.input_checks import camera_of_photo, convert_intrinsics
 from factorlib.dataset.read_dataset import read_dataset
-from factorlib.dataset.schema import ExternalCamera
+from factorlib.dataset.schema import ExternalCamera, ObjectsSlice
 from factorlib.dataset.slices import dataset_slice
 from factorlib.geometry.camera import Camera, Pose
+from factorlib.results.photos import PhotoFacts
 from tests.refusal import refusal
 
 SIZE = 200, 150
@@ -184,11 +186,24 @@ def test_a_field_of_view_is_a_focal_length_at_any_size_and_a_frames_own_lens_goe
     assert external["hall"].focal_px == 320.0 and external["attic"].focal_px == 300.0
 
 
+def test_without_a_focal_length_that_of_the_photo_or_its_exif_is_taken_and_else_none(folder):
+    lens = {"w": 200, "h": 150, "cx": 104, "cy": 71}
+    transforms(folder, [frame("hall", EYE, (0, 0, 5)), frame("attic", EYE, (0, 0, 5))], lens)
+    dataset = read(folder, OF_TRANSFORMS, photo={"camera": {"focal_px": 700.0}})
+    for name, focal, source in (("hall", 700.0, "dataset"), ("attic", 250.0, "exif"), ("attic", None, None)):
+        facts = PhotoFacts(200, 150, 1, (200, 150), focal, source, "srgb", None, "a", {}, 0.0)
+        slice_ = msgspec.convert(dataset_slice(dataset, "objects", name).facts, ObjectsSlice)
+        camera, known = camera_of_photo(slice_, facts, name)
+        assert (known.focal, known.source) == (focal, source) and camera.centre == (104, 71)
+        assert slice_.external.poses["chair"].translation == (0, 0, 5)
+
+
 FRAMES = [frame("hall", EYE, (0, 0, 5))]
 
 
 @pytest.mark.parametrize("lens, frames, key, words", [
-    ({"w": 200, "h": 150}, FRAMES, "frames[0].fl_x", "camera_angle_x"),
+    (LENS | {"camera_model": "OPENCV_FISHEYE"}, FRAMES, "transforms.json: frames[0]", "image_undistorter"),
+    (LENS | {"is_fisheye": True}, FRAMES, "transforms.json: frames[0]", "image_undistorter"),
     (LENS | {"k1": 0.1}, FRAMES, "transforms.json: frames[0]", "image_undistorter"),
     (LENS | {"camera_model": "EQUIRECTANGULAR"}, FRAMES, "frames[0].camera_model", "OPENCV"),
     (LENS, [frame("hall", 2 * EYE, (0, 0, 5))], "frames[0].transform_matrix", "not a rotation"),

@@ -228,6 +228,7 @@ CAMERA = {"focal_px": 300.0, "principal_point": [8.0, 6.0], "focal_source": "exi
 PLACED = {"rotation": EYE, "translation": [0.0, 0.0, 2.0], "scale": [1.0, 1.0, 1.0], "runner_up": None}
 POSES = {"hall": {"camera": CAMERA, "objects": {"vase": PLACED}}}
 PLAIN = {  # name -> what is written as JSON or YAML
+    "labelme.json": {"shapes": [{"label": "red", "points": [[1, 1], [6, 6]], "shape_type": "rectangle"}], "imageHeight": H},
     "truth.yaml": TRUTH, "coco.json": COCO, "t.json": TRANSFORMS, "model/scene_camera.json": SCENE_CAMERA,
     "model/scene_gt.json": SCENE_GT,
     "solve/materials.json": SOLUTION, "solve/exposures.json": {"hall": [1.0, 1.0, 1.0]}, "poses.json": POSES,

@@ -331,6 +331,10 @@ REFUSED = {
         (long_png(), "the mask is 30000 × 30000 pixels, the photo 16 × 12"), (rows(bytes(range(48)), kind=2), "colour"),
         (rows(bytes([7] * W)), "unknown label 7"), (rows(bytes(W)), "the mask is empty"),
     ],
+    ("mask", "labelme.json"): [
+        *({"shapes": [{"label": "red", "points": points}]} for points in ([], [[1, 1]], [[1, 1], [2, 900], [9, 9]], [[1]])),
+        {"shapes": [{"label": "red", "points": [[1, 1]], "shape_type": "rectangle"}]}, *JSONS,
+    ],
     ("mask", "coco.json"): [
         *(coco(shape) for shape in BAD_SHAPES), (coco([ZIGZAG]), "pixels long"),
         (coco(*WALLS), "all outlines together are"),
@@ -449,6 +453,7 @@ def test_it_is_refused_by_name_soon_and_in_little_memory(folder, reader, name):
 
 GOOD = [
     ("set", "dataset.yaml"), ("set", "truth.yaml"), ("set", "m/box.gltf"), ("mask", "mask.png"), ("mask", "coco.json"),
+    ("mask", "labelme.json"),
     ("photo", "7.png"), ("observations", "observations.parquet"), ("lobes", "solve/lobes.parquet"),
     ("poses", "poses.json"), ("objects", "m/chair.obj"), *(("mesh", name) for name in sample.MESHES),
 ]  # fmt: skip
@@ -687,7 +692,7 @@ PNG_KINDS = st.tuples(
 ANY_PNG = PNG_KINDS.map(lambda kind: png(png_header(W, H, *kind[:2]), zlib.compress(kind[2] * 4), PARTS_OF_PNG[2]))
 SETS = st.sampled_from([{}, *({"cameras": source} for source in SOURCES.values())])
 PLAIN_PARTS = {  # name -> the file that holds plain data as JSON, and who reads it
-    "COCO": ("coco.json", "mask"), "transforms.json": ("t.json", "transforms"),
+    "COCO": ("coco.json", "mask"), "labelme": ("labelme.json", "mask"), "transforms.json": ("t.json", "transforms"),
     "BOP cameras": ("model/scene_camera.json", "bop"), "BOP poses": ("model/scene_gt.json", "bop"),
     "earlier solution": ("solve/materials.json", "solution"), "earlier exposures": ("solve/exposures.json", "solution"),
     "earlier poses": ("poses.json", "poses"),

@@ -20,7 +20,7 @@ RNG = np.random.default_rng(3)
 RADIANCE = RNG.uniform(0, 0.9, (12, 18, 3)).astype(np.float32)  # 3:2, below clipping
 
 
-def save(path, pixels, names=None, **attributes):
+def save(path, pixels, names=None, window=(), **attributes):
     """Write an image in the type of `pixels`; attribute names with `__` for `:`."""
     kind = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float16": oiio.HALF, "float32": oiio.FLOAT}[pixels.dtype.name]
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
@@ -29,7 +29,9 @@ def save(path, pixels, names=None, **attributes):
         spec.channelnames = names
         spec.alpha_channel = names.index("A") if "A" in names else -1
     for name, value in attributes.items():
-        spec.attribute(name.replace("__", ":"), value)
+        spec.attribute(name.replace("__", ":"), *(["float[8]"] * (name == "chromaticities")), value)
+    for name, value in dict(window).items():
+        setattr(spec, name, value)
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels)), output.geterror()
     output.close()
@@ -107,6 +109,38 @@ def test_exr_channels_go_by_name_and_without_colours_it_is_refused(tmp_path):
     assert photo.radiance[0, 0].tolist() == [2, 3, 1]
     path = save(tmp_path / "b.exr", pixels[..., :2], names=["normal.x", "normal.y"])
     assert refusal("normal.x, normal.y", read_photo, path).cure
+
+
+AP1 = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)  # ACES: red, green, blue, white
+REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])  # of sRGB, IEC 61966-2-1
+
+
+@pytest.mark.parametrize("suffix", ["exr", "hdr"])
+def test_colours_of_other_primaries_are_rec709_and_those_of_rec709_the_same_bits(tmp_path, suffix):
+    def read(primaries, pixels):
+        path = save(tmp_path / f"a.{suffix}", pixels, **({} if suffix == "hdr" else {"chromaticities": primaries}))
+        line = b"\nPRIMARIES=%s\nFORMAT" % " ".join(map(str, primaries)).encode()
+        path.write_bytes(path.read_bytes().replace(b"\nFORMAT", line))
+        return read_photo(path).radiance
+
+    assert np.array_equal(read(REC709, RADIANCE), read_photo(save(tmp_path / f"b.{suffix}", RADIANCE)).radiance)
+    red, white = (XYZ @ read(AP1, np.full((2, 8, 3), colour, np.float32))[0, 0] for colour in ((0.5, 0, 0), (1, 1, 1)))
+    assert red / red.sum() == pytest.approx([0.713, 0.293, -0.006], abs=1e-3) and red[1] == pytest.approx(
+        0.5 * 0.2722, abs=1e-3
+    )
+    assert white / white.sum() == pytest.approx([0.32168, 0.33767, 0.34065], abs=1e-3)
+
+
+@pytest.mark.parametrize("left, top", [(2, 1), (-3, -2), (20, 1), (2, 13)])
+def test_the_pixels_of_an_exr_lie_where_its_display_window_says(tmp_path, left, top):
+    window = {"x": 5 + left, "y": 7 + top, "full_x": 5, "full_y": 7, "full_width": 20, "full_height": 13}
+    photo = read_photo(save(tmp_path / "a.exr", RADIANCE, window=window))
+    expected = np.full((60, 60, 3), np.nan)
+    expected[20 + top : 32 + top, 20 + left : 38 + left] = RADIANCE
+    expected = expected[20:33, 20:40]
+    assert np.array_equal(photo.finite, np.isfinite(expected[..., 0]))
+    assert np.array_equal(photo.radiance, np.nan_to_num(expected))
 
 
 def test_top_codes_are_clipped_and_what_is_not_finite_is_no_pixel_however_bright_floats_are(tmp_path):

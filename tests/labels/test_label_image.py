@@ -75,6 +75,32 @@ def box(x0, y0, x1, y1):
     return [x0, y0, x1, y0, x1, y1, x0, y1]
 
 
+def labelme(folder, shapes, size=(H, W)):
+    """shapes: (label, points, shape_type)."""
+    shapes = [{"label": name, "points": points, "shape_type": kind, "group_id": None} for name, points, kind in shapes]
+    content = {"version": "5", "shapes": shapes, "imagePath": "a.jpg", "imageHeight": size[0], "imageWidth": size[1]}
+    (folder / "labelme.json").write_text(json.dumps(content))
+    return "labelme.json"
+
+
+def cvat(folder, mode):
+    (folder / "m/SegmentationClass").mkdir(parents=True)
+    (folder / "m/labelmap.txt").write_text(
+        "# label:color_rgb:parts:actions\nbackground:0,0,0::\nred:250,250,0::\nwood:0,0,77::\n"
+    )
+    colours = np.array([[0, 0, 0], [250, 250, 0], [9, 9, 9], [0, 0, 77]], np.uint8)
+    Image.fromarray(colours[LABEL]).convert(mode, palette=Image.Palette.ADAPTIVE).save(
+        folder / "m/SegmentationClass/a.png"
+    )
+    return "m/SegmentationClass/a.png"
+
+
+def cut_out(inside):
+    return np.dstack(
+        [np.indices((H, W)).sum(0).astype(np.uint8)] * 3 + [np.where(inside, 200, 60 * (LABEL > 0)).astype(np.uint8)]
+    )
+
+
 RED, WOOD = LABEL == 1, LABEL == 3
 FORMS = {
     "grey": lambda at: save(at / "a.png", LABEL),
@@ -84,7 +110,14 @@ FORMS = {
     "16 bit": lambda at: save(at / "a.png", LABEL.astype(np.uint16)),
     "one each, 255": lambda at: {"wood": save(at / "w.png", WOOD * np.uint8(255)), "red": save(at / "r.png", RED * np.uint8(255))},
     "one each, 1": lambda at: {"red": save(at / "r.png", RED * np.uint8(1)), "wood": save(at / "w.png", WOOD * np.uint8(1))},
+    "one each, 16 bit": lambda at: {"red": save(at / "r.png", RED * np.uint16(65535)), "wood": save(at / "w.png", WOOD * np.uint16(50000))},
     "one each, 1 bit": lambda at: {"red": save(at / "r.png", RED), "wood": save(at / "w.png", WOOD)},
+    "transparent": lambda at: {"red": save(at / "r.png", cut_out(RED)), "wood": save(at / "w.png", cut_out(WOOD))},
+    "colours": lambda at: cvat(at, "RGB"),
+    "colours of a palette": lambda at: cvat(at, "P"),
+    "labelme": lambda at: labelme(at, [("red", [[3, 2], [12, 9]], "rectangle"), ("wood", [[5, 10], [25, 10], [25, 18], [5, 18]], "polygon")]),
+    "stored size": lambda at: coco(at, [(10, [box(3, 2, 12, 9)]), (12, [box(5, 10, 25, 18)])], [{"id": 7, "file_name": "kitchen.jpg", "width": H, "height": W}]),
+    "flat polygon": lambda at: coco(at, [(12, [box(5, 10, 25, 18), [1, 1, 1, 5]]), (10, [box(3, 2, 12, 9)])], [{"id": 7, "file_name": "kitchen.jpg", "width": 30.0, "height": 20.0}]),
     "polygons": lambda at: coco(at, [(12, [box(5, 10, 15, 18), box(15, 10, 25, 18)]), (10, [box(3, 2, 12, 9)])]),
     "RLE": lambda at: coco(at, [(10, rle(counts_of(RED))), (12, rle(compressed(WOOD)))]),
 }  # fmt: skip
@@ -132,11 +165,19 @@ def test_masks_that_are_empty_or_overlap(tmp_path):
     assert f"'red' and 'wood' share {RED.sum()} pixels" in message and "w.png" in message and "r.png" in message
 
 
+def test_an_outline_within_another_is_in_front_of_it_and_shapes_without_an_outline_are_refused(tmp_path, caplog):
+    result = labels(tmp_path, coco(tmp_path, [(10, [box(12, 12, 15, 15)]), (12, [box(5, 10, 25, 18)])]))
+    assert (result.label == 1).sum() == 9 and (result.label == 3).sum() == 151 and "'red' is in front" in caplog.text
+    assert "draw its outline" in refused(tmp_path, labelme(tmp_path, [("red", [[1, 1], [9, 9]], "line")]))
+
+
 def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
     images = lambda *names: [{"id": 6 + k, "file_name": f"{name}.jpg"} for k, name in enumerate(names)]  # noqa: E731
     name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("other/kitchen", "photos/kitchen"))
     assert labels(tmp_path, name).label.any()
     assert "2 images" in refused(tmp_path, coco(tmp_path, [], images=images("a/kitchen", "b/kitchen")))
+    for changed in ("a\\1/90fbb0c7-kitchen", f"kitchen_jpg.rf.{'0f1e2d3c' * 4}"):
+        assert labels(tmp_path, coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("no", changed))).label.any()
     assert "did you mean 'kitchem.jpg'" in refused(tmp_path, coco(tmp_path, [], images=images("kitchem")))
 
 

@@ -11,7 +11,8 @@ from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipp
 from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read_mesh import merged_normals, read_mesh, usable
 from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
-from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals, triangulate
+from tests.faults import sample
 from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put
 from tests.refusal import refusal
 
@@ -169,6 +170,46 @@ def test_a_truncated_text_is_refused(tmp_path, name):
 
 def test_polygons_of_different_lengths_in_a_binary_ply_are_read(tmp_path):
     assert len(read_all(tmp_path / "a.ply", binary_ply_of(*SQUARE_AND_TWO)).faces) == 4
+
+
+# an L, whose fan about any corner but two leaves it, with the numbers of colours behind its row
+CORNERS = [(2, 0, 0), (2, 1, 0), (1, 1, 0), (1, 2, 0), (0, 2, 0), (0, 0, 0)]
+ROWS = "".join("{} {} {}\n".format(*corner) for corner in CORNERS) + "6 0 1 2 3 4 5 6 0 0 0 0 0 0 9 1 1 1\n"
+ELL = {
+    "a.obj": "".join("v {} {} {}\n".format(*corner) for corner in CORNERS) + "f 1 2 3 4 5 6",
+    "a.off": "OFF\n6 1 0\n" + ROWS,
+    "a.ply": sample.PLY_HEADER.format("ascii").replace("x 4", "x 6").replace("e 4", "e 1") + ROWS,
+    "b.ply": sample.PLY_HEADER.format("binary_little_endian").replace("x 4", "x 6").replace("e 4", "e 1").encode()
+    + np.array(CORNERS, "<f4").tobytes() + b"\6" + np.arange(6, dtype="<i4").tobytes(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ELL)
+def test_a_concave_polygon_has_its_own_area_and_what_a_row_holds_beyond_the_header_is_no_part_of_it(tmp_path, name):
+    mesh = read_all(tmp_path / name, ELL[name])
+    assert len(mesh.faces) == 4 and area_of(mesh, 1) == pytest.approx(3)
+    assert np.abs(mesh.normals[:, 2]).min() == pytest.approx(1) and np.ptp(mesh.normals[:, 2]) == 0
+
+
+def test_a_star_is_filled_by_as_many_triangles_as_any_polygon_of_its_corners():
+    turn = np.arange(40) * np.pi / 20
+    star = np.stack([np.cos(turn), np.sin(turn), 0.3 * np.cos(turn)], 1) * np.where(np.arange(40) % 2, 1, 0.3)[:, None]
+    sizes, corners = np.array([3, 40, 4]), np.concatenate([[0, 2, 4], np.arange(40), [1, 3, 5, 7]])
+    triangles = corners[triangulate(star, sizes, corners)]
+    assert triangles[0].tolist() == [0, 2, 4] and triangles[-2:].tolist() == [[1, 3, 5], [1, 5, 7]]
+    area = area_vectors(star, triangles[1:-2]) @ (-0.3, 0, 1)
+    assert len(area) == 38 and area.min() > 0
+    assert area.sum() == pytest.approx(1.09 * 40 * 0.15 * np.sin(np.pi / 20))
+
+
+def test_names_of_obj_keep_their_hash_and_a_comment_is_still_one(tmp_path):
+    named = (
+        QUADS.replace("plastic", "Material #1")
+        .replace("usemtl wood", "usemtl Material #2 # legs\n#")
+        .replace("6 5", "6 5#")
+    )
+    mesh = read_mesh(put(tmp_path / "mesh.obj", named), MATERIALS, {"Material #1": "red", "Material #2": "oak"})
+    assert area_of(mesh, 1) == pytest.approx(3) and area_of(mesh, 2) == pytest.approx(3)
 
 
 # ── Smooth normals: exact on a sphere, sharp at creases, indifferent to duplicates, winding and tessellation ────────

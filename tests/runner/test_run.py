@@ -138,6 +138,9 @@ def test_a_dataset_that_is_not_there_and_two_folders_of_one_name_are_refused(pro
     with pytest.raises(InputError, match="two datasets are called 'set'"):
         verbs.make(project, verbs.Request(str(tmp_path / "else" / "set")))
     assert verbs.make(project, verbs.Request(str(project.root / "data" / "set"))) == 0  # the same one by its path
+    shutil.move(project.root / "data" / "set", tmp_path / "set")
+    assert verbs.make(project, verbs.Request(str(tmp_path / "set"))) == 0
+    assert verbs.make(project, verbs.Request("set")) == 0  # its results name its folder, as the report's commands do
 
 
 # ── what fails ───────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -1,9 +1,11 @@
 """From photos and masks alone: cameras, a hull, bodies of revolution, and the poses of all, through `masks`, `shapes` and `align`."""
 
+import msgspec
 import numpy as np
 import pytest
 
 from factorlib.dataset.read_dataset import read_dataset
+from factorlib.dataset.schema import MeshEntry
 from factorlib.generate.folder import write_labels, write_photo
 from factorlib.generate.solids import SHAPES
 from factorlib.geometry.camera import Camera
@@ -12,9 +14,15 @@ from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.scenes.stage_runs import run_stages
 from stages import align, masks, shapes
-from tests.shapes.outlines import looking_from, views_of
+from tests.refusal import refusal
+from tests.shapes.outlines import looking_from, outline, views_of
 
 AROUND = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(8)]
+
+
+def test_a_hull_is_refused_where_nothing_tells_the_focal_length():
+    posed = [msgspec.structs.replace(outline(SHAPES["blob"](), pose, True), focal_sigma=0.5) for pose in AROUND[:2]]
+    refusal("focal lengths", shapes.estimate_shape, MeshEntry(hull=True, material="red"), posed, shapes.Params(), print)
 
 
 def test_photos_and_masks_of_a_body_at_rest_give_cameras_a_hull_and_normals(tmp_path):

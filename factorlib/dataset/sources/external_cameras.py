@@ -67,7 +67,8 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
                 camera = ExternalCamera(kind, intrinsics.focal_px, intrinsics.principal_point, None, poses)
             else:
                 focal, centre = pinhole(image.camera, image.key, refuse)
-                camera = ExternalCamera(kind, focal, None if image.centred else centre, image.size, poses)
+                known = focal if image.focal_known else None
+                camera = ExternalCamera(kind, known, None if image.centred else centre, image.size, poses)
             external[photo.name] = camera
             if source.world_from_camera and photo.world_from_camera is None:
                 assert image.cam_from_world is not None  # world_from_camera does not go with bop, which has no world

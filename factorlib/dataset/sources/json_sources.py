@@ -81,6 +81,7 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
             }
         )
         camera, size = _camera(key, lens, refuse)
+        focal_known = lens.fl_x is not None or lens.camera_angle_x is not None
         centred = lens.cx is None or lens.cy is None
         matrix_key = f"{key}.transform_matrix"
         rows = frame.transform_matrix
@@ -93,7 +94,8 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
         refuse.check_rotation(matrix_key, tuple(row[:3] for row in rows[:3]))
         right, down, forward = ((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
         cam_from_world = rigid_motion((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
-        images.append(SourceImage(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
+        place = f"{file.name}: {key}"
+        images.append(SourceImage(frame.file_path, camera, size, place, centred, focal_known, cam_from_world))
     return images
 
 
@@ -102,15 +104,10 @@ def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Came
 
     Without `w`, a field of view gives the focal length of an image of width ANY_WIDTH.
     """
-    focal = lens.fl_x
+    angle = lens.camera_angle_x
+    focal = ANY_WIDTH if lens.fl_x is None and angle is None else lens.fl_x  # the former stands for an unknown one
     if focal is None:
-        angle = lens.camera_angle_x
-        if angle is None:
-            refuse(
-                f"{key}.fl_x",
-                "neither fl_x nor camera_angle_x is given",
-                "give the focal length fl_x in pixels, with w and h",
-            )
+        assert angle is not None
         focal = (lens.w or ANY_WIDTH) / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
         refuse.refuse_if(
             not FOCAL_PX[0] <= focal <= FOCAL_PX[1],

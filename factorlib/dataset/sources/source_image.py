@@ -30,6 +30,7 @@ class SourceImage(msgspec.Struct, frozen=True):
         size: size of the image in pixels, as in `schema.ExternalCamera`
         key: place in the source, for messages
         centred: True if the source does not give the principal point
+        focal_known: False if the source does not give the focal length
         cam_from_world: None if the source has no world
         poses: cam_from_object of each instance by obj_id, in millimetres
     """
@@ -39,6 +40,7 @@ class SourceImage(msgspec.Struct, frozen=True):
     size: tuple[float, float | None] | None
     key: str
     centred: bool = False
+    focal_known: bool = True
     cam_from_world: pycolmap.Rigid3d | None = None
     poses: dict[int, list[RigidTransform]] = {}
 
@@ -102,7 +104,9 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         fault = f"its focal length {focals[0]:g} px or principal point ({centre[0]:g}, {centre[1]:g}) is implausible"
         cure = f"focal lengths are {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, principal points up to {CENTRE_PX:g} px away"
         refuse(key, fault, f"{cure}; {DAMAGED}")
-    if camera.is_undistorted() and focals[0] == focals[1]:
+    # a fisheye's projection is no pinhole's, even with all parameters 0
+    undistorted = camera.is_undistorted() and "FISHEYE" not in camera.model_name
+    if undistorted and focals[0] == focals[1]:
         return float(focals[0]), centre
     pixels = [[camera.width * i / (GRID - 1), camera.height * j / (GRID - 1)] for i in range(GRID) for j in range(GRID)]
     places = pixels - camera.calibration_matrix()[:2, 2]  # an array, as pycolmap's are
@@ -120,7 +124,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
             "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
             "or undistort by `colmap image_undistorter` and use its images, its model, and masks of them"
         )
-        if camera.is_undistorted():
+        if undistorted:
             cause = "the camera's pixels are not square"
             cure = (
                 "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
