@@ -9,10 +9,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new label compare validate verify clean gc pack setup lock test test-long docs results study studies data help help-all $(STAGES)
+.PHONY: all plan why status graph logs params new photos label compare validate verify clean gc pack setup lock test test-long docs results study studies data help help-all $(STAGES)
 
 # each reads DATASET, SET, HELD_OUT and FORCE from the environment
-all plan why status graph logs params new label compare validate verify pack $(STAGES): .venv/ready
+all plan why status graph logs params new photos label compare validate verify pack $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 clean: .venv/ready
@@ -62,7 +62,8 @@ data: .venv/ready
 help:
 	@echo 'make all DATASET=eames                     start here: run the example; it ends by naming the report to open'
 	@echo 'make render DATASET=eames RECIPE=insert    then a picture of the result: a ball in every photo (docs/recipes.md)'
-	@echo 'make new DATASET=mychair PHOTOS=<folder>   begin a data set of your own (docs/tutorial.md)'
+	@echo 'make photos DATASET=mychair PHOTOS=<folder>   a data set of your own, with automatic masks (docs/photos.md)'
+	@echo 'make new DATASET=mychair PHOTOS=<folder>   begin one with masks and meshes of your own (docs/tutorial.md)'
 	@echo 'make validate DATASET=mychair              look at all its files, in a second; then make all DATASET=mychair'
 	@echo 'make help-all                              everything else'
 
@@ -76,6 +77,7 @@ help-all:
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'
 	@echo 'make plan | why | status DATASET=…   list the steps that would run; every reason; progress and warnings'
 	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'
+	@echo 'make photos DATASET=mychair PHOTOS=… [MESHES=…] [MATTE=<file.onnx>]   the same with automatic masks, cameras and a hull'
 	@echo 'make label DATASET=mychair [PORT=…]   draw masks in a browser: boxes, clicks, brush (docs/dataset.md)'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
 	@echo 'make logs DATASET=… STAGE=… PHOTO=…  time, peak memory, versions and warnings of results'
@@ -97,6 +99,7 @@ help-all:
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
 	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX, OpenUSD'
+	@echo '     EXTRAS=masks                     and the network of automatic masks (docs/photos.md)'
 	@echo '     EXTRAS=video                     and PyAV: animations as MP4, too (docs/recipes.md)'
 	@echo '     EXTRAS=denoise                   and Intel Open Image Denoise: `denoise: true` in recipes (docs/recipes.md)'
 	@echo '     EXTRAS=dask                      and Dask: SET="executor=tcp://…" runs steps on a cluster (docs/distributed.md)'

@@ -45,6 +45,7 @@ from factorlib.labels.mask_files import (
     read_labels_in,
 )
 from factorlib.meshes.read_mesh import read_mesh, read_parts
+from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder
 from factorlib.reading import reading
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
@@ -63,6 +64,7 @@ LABELMAP = "labelmap.txt"  # names of the colours in CVAT's masks
 SIDE = 400  # longest side of a silhouette for pairing, pixels
 BESIDE = "\x1f"  # separates a value from the comment beside it
 HULL = "thing"  # name of the mesh if none is given
+WHOLE = {"mask", *(suffix[1:] for suffix in IMAGES)}  # endings of masks of all of an object: Metashape's, COLMAP's
 NO_MESH = (
     "there is no mesh: `hull: true` and `cameras: {sfm: true}` are written, which need photos that overlap, "
     "each 10 to 20° from the next; "
@@ -73,6 +75,9 @@ NO_MASKS = (
     "there are no masks: `make label` draws them in the browser, once `materials` has their names; "
     "or give MASKS=<folder>"
 )
+
+NO_MATERIAL = "no mask names a material: write the names in `materials`, label k of a mask the k-th"
+RESERVED = "photo {0}: write another `name`: a file of the results is called {0}"
 
 
 class Masks(msgspec.Struct):
@@ -89,55 +94,69 @@ class Masks(msgspec.Struct):
     silhouettes: dict[str, dict[str, str]] = {}
 
 
-def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | None) -> list[str]:
+def photos_in(photos: Path) -> tuple[dict[str, Path], dict[str, Path], Cameras | None]:
+    """Return the photos of a folder by name, masks by the stems of their photos' names, and cameras."""
+    files, masks, cameras = read_photo_folder(photos, _files(photos, SUFFIXES, "PHOTOS", deep=True))
+    images = _by_name(files, "PHOTOS", photos)
+    if not images:
+        fault = f"the folder has no photos ({', '.join(IMAGES[:6])}, …)"
+        raise InputError(fault, file=photos, key="PHOTOS", cure="name the folder of the photos")
+    return images, masks, cameras
+
+
+def new_dataset(
+    target: Path, photos: Path, masks: Path | None, meshes: Path | None, cameras: Cameras | None = None
+) -> list[str]:
     """Copy the files, write target/dataset.yaml, and return what is still missing, in words.
 
     Args:
         target: the folder to create
         photos: folder of photos
-        masks: folder of masks
+        masks: folder of masks; None: those that lie among the photos
         meshes: folder of meshes
+        cameras: cameras of the photos; None: those that lie among them
 
     Raises:
-        InputError: The target exists or cannot be created, or a folder is missing or has no photos.  It is also raised
-            for a link, an unprintable file name, and too many pixels.
+        InputError: The target exists, or a folder is missing, has no photos, or a link or a file with too many pixels.
     """
-    above = _check_target(target)
-    images = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
-    if not images:
-        fault = f"the folder has no photos ({', '.join(IMAGES[:6])}, …)"
-        raise InputError(fault, file=photos, key="PHOTOS", cure="name the folder of the photos")
-    mask_files = _files(masks, (".png", ".json", LABELMAP), "MASKS", deep=True) if masks is not None else []
-    mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # including .mtl and buffers
+    above = check_target(target)
+    images, photo_masks, source = photos_in(photos)
+    masks, mask_files = _mask_files(masks, sorted(photo_masks.values()))
+    mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes else []  # including .mtl and buffers
     missing: list[str] = []
     paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
     labelled = _masks(masks, mask_files, list(images), missing) if masks else _cut_outs(paths, images, missing)
     entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
     missing += _missing_masks(list(images), labelled) if masks or labelled.by_photo else [NO_MASKS]
-    missing += [
-        f"photo {photo}: write another `name`: a file of the results is called {photo}"
-        for photo in images
-        if photo in RESERVED_PHOTOS
-    ]
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
-        parts = {name: name for name in labelled.materials}
-        entries = {HULL: {"hull": True} | ({"parts": parts} if len(parts) > 1 else {"material": spec["materials"][0]})}
-        spec["cameras"] = {"sfm": True}
+        missing += [] if cameras or source else [NO_MESH]
+        cameras = cameras or source or Cameras({"sfm": True})
+        entries = {HULL: _shape(spec["materials"], cameras)}
         visible = {photo: [HULL] for photo in images}
-        missing.append(NO_MESH)
-    if not labelled.materials and masks is not None:
-        missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
+    cameras = cameras or source or Cameras()
+    spec |= {"cameras": cameras.source} if cameras.source else {}
+    missing += [NO_MATERIAL] * (not labelled.materials and masks is not None)
+    missing += [RESERVED.format(photo) for photo in images if photo in RESERVED_PHOTOS]
     spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled)}
+    spec["photos"] = [photo | cameras.by_photo.get(photo["name"], {}) for photo in spec["photos"]]
     sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
-    places = {name: (folder, files) for name, (folder, files) in sources.items() if folder is not None}
+    sources["cameras"] = cameras.folder, cameras.files
+    places = {name: (folder, files) for name, (folder, files) in sources.items() if folder}
     _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     _write(target, spec, places, above)
     return missing
 
 
-def _check_target(target: Path) -> Path:
+def _mask_files(masks: Path | None, beside: list[Path]) -> tuple[Path | None, list[Path]]:
+    """Return the folder of masks and its files; without a folder, that of the masks beside the photos, if any."""
+    if masks is None:
+        return (Path(os.path.commonpath([path.parent for path in beside])), beside) if beside else (None, [])
+    return masks, _files(masks, (".png", ".json", LABELMAP), "MASKS", deep=True)
+
+
+def check_target(target: Path) -> Path:
     """Return the folder in which the target can be created.  Raises InputError where it cannot be."""
     if not target.name.isprintable():
         raise InputError(f"the name {target.name!a} cannot be printed", key="DATASET", cure="choose another name")
@@ -171,6 +190,12 @@ def _missing_masks(photos: list[str], labelled: Masks) -> list[str]:
     """List the photos without a mask."""
     without = [photo for photo in photos if photo not in labelled.by_photo]
     return [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png" for photo in without]
+
+
+def _shape(materials: list[str], cameras: Cameras) -> dict[str, Any]:
+    """Return the entry of a mesh without a file: a hull, or open where no cameras are known."""
+    parts = {"parts": {name: name for name in materials}} if len(materials) > 1 else {"material": materials[0]}
+    return ({"hull": True} if cameras.source else {"file": UNKNOWN}) | parts
 
 
 def _photo_entries(
@@ -308,7 +333,8 @@ def _masks_by_photo(
         elif path.parent == folder:
             for cut in (k for k, letter in enumerate(name) if letter == "_"):
                 if name[:cut] in further:
-                    further[name[:cut]][name[cut + 1 :]] = path
+                    material = name[cut + 1 :]
+                    further[name[:cut]][HULL if material.lower() in WHOLE else material] = path
         elif path.parent.parent == folder and path.parent.name in further:
             further[path.parent.name][name] = path
     return whole, further
@@ -428,10 +454,14 @@ def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool 
     return sorted(paths)
 
 
-def _by_name(paths: list[Path], key: str) -> dict[str, Path]:
+def _by_name(paths: list[Path], key: str, folder: Path | None = None) -> dict[str, Path]:
+    """Return the files by name; in subfolders of `folder`, namesakes by the names of these as well."""
     named: dict[str, Path] = {}
+    times = Counter(path.stem for path in paths)
     for path in paths:
-        if (namesake := named.setdefault(name := _word(path.stem), path)) != path:
+        whole = folder is not None and times[path.stem] > 1 and path.parent != folder
+        stem = str(path.relative_to(folder).with_suffix("")) if whole else path.stem  # type: ignore[arg-type]
+        if (namesake := named.setdefault(name := _word(stem), path)) != path:
             fault = f"{path.name} and {namesake.name} would both be called {name!r}"
             raise InputError(fault, file=path, key=key, cure="rename one of them")
     return named

@@ -36,8 +36,8 @@ TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linu
 LOADED = (
     "torch, scipy.optimize, mitsuba, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, xatlas, factorlib.geometry.open3d"
 )
-# extras installed without dependencies: .venv has what they need, and bpy would require an older NumPy
-ALONE = ("blender", "interchange")
+# extras installed without dependencies: .venv has what they need; bpy would require an older NumPy, rembg OpenCV
+ALONE = ("blender", "interchange", "masks")
 # system libraries of Open3D and, for renders that are three times faster, of Mitsuba; and their Debian packages
 NEEDED = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1", "libgomp.so.1": "libgomp1"}
 FASTER = {"libLLVM.so.19.1": "libllvm19"}

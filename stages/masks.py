@@ -14,6 +14,7 @@ import numpy as np
 from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.camera_files import is_raw
+from factorlib.images.colours import count_colours
 from factorlib.images.exr import write_exr
 from factorlib.images.lens import Undistortion, radial_lens
 from factorlib.images.photo import Photo, box_majority, check_bright, decode_photo, least_factor, open_photo
@@ -28,6 +29,8 @@ log = logging.getLogger("factorlib.masks")
 CURE = (
     "materials and lights take it for shading; use the raw file, or take it again with HDR, portrait and sharpening off"
 )
+
+SPLIT = "split it in `make label`, or let the texture hold the paint (docs/texture.md)"
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -79,6 +82,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     photo, labels, objects = undistort_photo(photo, labels, objects, facts, f"{entry}.camera.distortion")
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
     warn_of_processing(opened.exif, photo, labels, path)
+    for number, material in enumerate(materials, 1):
+        if count_colours(photo.radiance[valid & (labels.label == number) & ~photo.clipped.any(axis=-1)]) > 1:
+            log.warning("%s: the mask of '%s' holds several colours: %s", path, material, SPLIT)
     progress(2, 3, f"{name}: writing")
     colours = {c: photo.radiance[..., k] for k, c in enumerate("RGB")}
     clipped = {f"clipped.{c}": photo.clipped[..., k] for k, c in enumerate("RGB")}

@@ -30,6 +30,7 @@ EXTRAS = {  # of modules that import what an extra alone installs
         ("runner/worker", "dask"),
         ("images/film", "video"),
         ("tracing/scene", "denoise"),
+        ("onboarding/matte", "masks"),
     )
 }
 

@@ -43,7 +43,9 @@ Rotation = Float[np.ndarray, "3 3"]
 VIEWS = 60  # directions of view per pairing
 ROLLS = 18  # rotations of the photo per view
 LEAST_SHARE = 0.02  # share of an object's pixels: a label with fewer is a slip of the brush
-MOST_PAIRINGS = 24  # pairings of one observation; each takes 0.1 s
+MOST_PAIRINGS = 24  # pairings of one observation that are compared in full; each takes 0.1 s
+FEWER = 4  # factor by which views and rolls are fewer where more pairings are compared first
+MOST_COMPARED = 600  # pairings that are compared first, at 6 ms each
 MOST_ROLES = 5000  # assignments of all labels to parts
 HIDDEN = 0  # label of a part that is not visible
 FOCAL = 1.2  # focal length of a phone in units of the photo's longer side; the outline changes little with it
@@ -278,15 +280,19 @@ def _costs(mesh: Mesh, parts: int, silhouette: Silhouette) -> dict[tuple[int, ..
     if not 0 < len(visible) <= parts or (len(visible) + 1) ** parts > MOST_ROLES:
         return {}
     pairings = [each for each in product([HIDDEN, *visible], repeat=parts) if set(each) >= set(visible)]
-    if len(pairings) > MOST_PAIRINGS:
+    if len(pairings) > MOST_COMPARED:
         return {}
     if len(pairings) == 1:
         return {pairings[0]: 0.0}
     height, width = silhouette.label.shape
     view = ObjectView(silhouette, Camera(width, height, FOCAL * max(height, width), (width / 2, height / 2)))
-    costs = {}
-    for pairing in pairings:
+
+    def cost(pairing: tuple[int, ...], fewer: int = 1) -> float:
+        """Return the cost of a pairing, by a fraction of the views and rolls."""
         label = np.array([0, *(k or len(counts) for k in pairing)], np.int16)[mesh.face_label]
         caster = Caster(msgspec.structs.replace(mesh, face_label=label))
-        costs[pairing] = min(match.error for match in match_templates(caster, view, VIEWS, ROLLS)[0])
-    return costs
+        return min(match.error for match in match_templates(caster, view, VIEWS // fewer, ROLLS // fewer)[0])
+
+    if len(pairings) > MOST_PAIRINGS:
+        pairings = sorted(pairings, key=lambda pairing: cost(pairing, FEWER))[:MOST_PAIRINGS]
+    return {pairing: cost(pairing) for pairing in pairings}

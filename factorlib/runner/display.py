@@ -7,13 +7,16 @@ none of it may move the cursor, set a colour or a title, or ring the bell.
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
+import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, TextIO, cast
 
 from factorlib.runner.plan import PlannedStep, Step
 
+MOST_WARNINGS = 5  # lines of warnings at the end of a run
 BEAT = 10.0  # seconds of silence after which progress is a line, away from a terminal
 
 
@@ -24,6 +27,27 @@ def printable(text: str) -> str:
     'a\\x1b[31mb\\u202ec\n'
     """
     return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+
+
+def warning_lines(warnings: Sequence[tuple[Step, str]]) -> list[str]:
+    """Format warnings of steps for a person: at most MOST_WARNINGS lines, each of one fault and all that have it.
+
+    Warnings that differ in numbers, paths and the photo's name are one fault.
+
+    >>> warning_lines([(Step("masks", p), f"data/{p}.jpg: is a crop") for p in ("hall", "yard")])
+    ['warning: masks/hall: data/hall.jpg: is a crop (and 1 more: yard)']
+    """
+    groups: dict[str, list[tuple[Step, str]]] = {}
+    for step, text in warnings:
+        words = re.sub(rf"\S*/\S*|\b{re.escape(step.item)}\b|\d+", "", text)
+        groups.setdefault(f"{step.stage}: {words}", []).append((step, text))
+    lines = []
+    for (step, text), *others in groups.values():
+        names = textwrap.shorten(", ".join(dict.fromkeys(each.item for each, _ in others)), 80, placeholder=" …")
+        lines.append(f"warning: {step}: {text}" + f" (and {len(others)} more: {names})" * bool(names))
+    if (left := len(lines) - MOST_WARNINGS) > 0:
+        lines[-left - 1 :] = [f"{left + 1} more warnings: `make status` and the report have all"]
+    return lines
 
 
 class PrintableStream:

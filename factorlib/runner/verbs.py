@@ -5,13 +5,14 @@ from __future__ import annotations
 import ast
 import contextlib
 import inspect
+import logging
 import os
 import signal
 import sys
 import textwrap
 import time
 from collections import Counter
-from collections.abc import Sequence, Sized
+from collections.abc import Callable, Iterator, Sequence, Sized
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -86,7 +87,7 @@ def _print_results(state: DatasetState, whole: bool) -> str:
 
 
 def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
-    from factorlib.runner.display import Display
+    from factorlib.runner.display import Display, warning_lines
     from factorlib.runner.run import run
 
     started = time.perf_counter()
@@ -101,6 +102,7 @@ def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
     finally:
         display.close()
     name = state.data.folder.name
+    print(*(f"{line}\n" for line in warning_lines(result.warnings)), sep="", end="", file=sys.stderr)
     if failed := list(result.failed):
         print(f"{name}: {count(failed)} failed: {summarize(failed, MOST_FAILED, ', ')}")
         if result.held_up:
@@ -239,39 +241,62 @@ def validate(
 
 def _draw_sheet(project: Project, folder: Path) -> None:
     """Draw each photo of a dataset beside its labels and meshes; the dataset may be unfinished."""
-    from factorlib.runner.display import Display
-
     results = results_of(project, folder)
     results.set_owner(project, folder)
     path = results.folder / "sheet.png"
-    step = Step("sheet")
-    with contextlib.closing(Display()) as display:
-        display.start(step)
-        progress = partial(display.progress, step, text="")
-        import_module("factorlib.contact_sheet").write_sheet(folder, path, progress)  # by name: it is science
+    with _shown("sheet") as progress:  # by name: it is science
+        import_module("factorlib.contact_sheet").write_sheet(folder, path, partial(progress, text=""))
     print(f"  contact sheet: {project.short_path(path)}")
 
 
-def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
-    """Create a dataset from folders of files, and print what is left to do."""
+def begin(
+    project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None, auto: bool = False
+) -> int:
+    """Create a dataset from folders of files, and print what is left to do.
+
+    auto: estimate masks and cameras; `masks` then is the ONNX file of another matting network, or None
+    """
     if photos is None:
-        cure = "add PHOTOS=<folder>, and MASKS=<folder> and MESHES=<folder> if you have these"
+        cure = "add PHOTOS=<folder>, and for `make new` MASKS=<folder> and MESHES=<folder> if you have these"
         raise InputError("no folder of photos is named", key="PHOTOS", cure=cure)
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
-    missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
+    notes = []
+    if auto:
+        with _shown("photos") as progress:  # modules by name: they are science
+            create = import_module("factorlib.onboarding.from_photos").dataset_from_photos
+            missing, notes = create(folder, photos, meshes, masks, lambda share, text: progress(share, 1, text))
+    else:
+        missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
     ending = "; still missing, or yours to decide:" if missing else ""
     print(f"{project.short_path(folder)}/dataset.yaml is written{ending}")
-    for line in missing:
+    for line in (*missing, *notes):
         print(f"  {line}")
     try:
         _draw_sheet(project, folder)
     except InputError as fault:
         print(f"  no contact sheet: {fault}")
+    if auto and not missing:
+        return validate(project, dataset, [])
     drawn = f"name your materials in it, then {project.command('label', dataset)}, then "
     first = drawn if any("make label" in line for line in missing) else ""
     print(f"next: {first}{project.command('validate', dataset)}")
     return 0
+
+
+@contextlib.contextmanager
+def _shown(name: str) -> Iterator[Callable[..., None]]:
+    """Display the progress of the code inside, as of a step; yield its report of done, total and activity."""
+    from factorlib.runner.display import Display
+
+    step = Step(name)
+    logging.disable(logging.WARNING)  # A run repeats the warnings of its photos.
+    try:
+        with contextlib.closing(Display()) as display:
+            display.start(step)
+            yield partial(display.progress, step)
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def label_masks(project: Project, dataset: str, port: int) -> int:

@@ -10,11 +10,13 @@ there.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import count
 
 import msgspec
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -31,6 +33,10 @@ SMOOTHINGS = (10, 40, 160, 640)  # rounds of smoothing; the most that keep the o
 SMOOTHED_AWAY = 0.004  # overlap (IoU) that smoothing may cost
 SLAB = 1 << 18  # number of points evaluated at once
 LEAST_Z = 1e-6  # least depth in front of a camera
+SAMPLES = 40  # of `agreements`: pixels a side, and depths of each pixel's ray
+MARGIN = 1.2  # extent of the examined part of a photo, in those of its outline
+FOCALS = (0.7, 5.0)  # range of `focal_by_hull`, in units of the photo's longer side
+TRIALS = 16  # most focal lengths that are tried
 
 Points = Float[np.ndarray, "n 3"]
 
@@ -63,12 +69,12 @@ def visual_hull(
     low = middle - radius
     high = middle + radius
     # sample f on a coarse grid to locate the body, then on a fine one about it
-    for count in (COARSE_CELLS, cells):
-        step = float((high - low).max()) / count
+    for size in (COARSE_CELLS, cells):
+        step = float((high - low).max()) / size
         shape = np.ceil((high - low) / step).astype(int) + 3
         origin = (low + high) / 2 - step * (shape - 1) / 2
         field = _sample(outlines, origin, step, shape, report)
-        least = -step if count == COARSE_CELLS != cells else 0  # the coarse grid also keeps parts thinner than a cell
+        least = -step if size == COARSE_CELLS != cells else 0  # the coarse grid also keeps parts thinner than a cell
         inside = np.argwhere(field > least)
         if not len(inside):
             cure = (
@@ -173,6 +179,52 @@ def signed_distance(outlines: Sequence[Outline], points: Points) -> Float[np.nda
         inner = np.minimum(inner, FREE) * depth / outline.camera.focal
         least = np.minimum(least, np.where(z > LEAST_Z, inner, -1.0))
     return least
+
+
+def agreements(outlines: Sequence[Outline]) -> list[float]:
+    """Return the IoU of each outline with the silhouette of the hull of all others.  All need poses.
+
+    Raises:
+        InputError: All photos see the object from the same side, or one has it behind its camera.
+    """
+    middle, radius = _bounding_ball(outlines)
+    overlaps = []
+    for k, outline in enumerate(outlines):
+        pose = outline.known_pose
+        extent = MARGIN * bounding_box(outline.view.silhouette)[2] / 2
+        places = outline.middle[:, None] + np.linspace(-extent, extent, SAMPLES)
+        pixels = np.stack(np.meshgrid(*places), axis=-1).reshape(-1, 2)
+        # points on the rays of the pixels, in the object's frame, and whether any of a ray is in the hull of the others
+        depths = pose.apply(middle[None])[0, 2] + MARGIN * radius * np.linspace(-1, 1, SAMPLES)
+        points = outline.camera.rays_through(pixels)[:, None] * depths[:, None]
+        distance = signed_distance(
+            [*outlines[:k], *outlines[k + 1 :]], ((points - pose.translation) @ pose.rotation).reshape(-1, 3)
+        )
+        hull = (distance.reshape(len(pixels), SAMPLES) > -MARGIN * radius / SAMPLES).any(axis=1)
+        mask = outline.inner(pixels) > 0
+        overlaps.append(float((hull & mask).sum() / max((hull | mask).sum(), 1)))
+    return overlaps
+
+
+def focal_by_hull(
+    outlines: Callable[[float], Sequence[Outline]], longest: int, report: Callable[[float], None] = lambda share: None
+) -> float:
+    """Return the focal length, common to all photos, at which the hull fills their outlines best.
+
+    Args:
+        outlines: Outlines by focal length, pixels.
+        longest: Longer side of the photos, pixels.
+        report: Called with the completed share, from 0 to 1.
+    """
+    steps = count()
+
+    def misfit(log: float) -> float:
+        """Return the negative overlap for a log focal length."""
+        report(min(next(steps) / TRIALS, 1.0))
+        return -hull_overlap(outlines(float(np.exp(log))))
+
+    bounds = np.log(longest * np.array(FOCALS))
+    return float(np.exp(minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": TRIALS}).x))
 
 
 def _sample(

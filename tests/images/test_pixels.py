@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from factorlib.dataset.schema import Intrinsics
+from factorlib.images.colours import count_colours
 from factorlib.images.lens import Undistortion, radial_lens
 from factorlib.images.photo import Photo, box_mean
 from factorlib.images.picture import read_png, write_png
@@ -170,3 +171,14 @@ def test_coefficients_of_no_lens_are_refused_and_no_distortion_is_no_lens():
     refusal("map two rays", folded.check, W, H, "dataset.yaml", "photos[a].camera.distortion")
     LENS.check(W, H, "dataset.yaml", "photos[a].camera.distortion")
     assert radial_lens(None, 1, W, H) is None and radial_lens(Intrinsics(focal_px=140.0), 1, W, H) is None
+
+
+@pytest.mark.parametrize("other, share, colours", [
+    ((0.5, 0.1, 0.1), 0.3, 1), ((0.1, 0.2, 0.5), 0.3, 2), ((0.1, 0.2, 0.5), 0.04, 1),
+])  # fmt: skip
+def test_shading_and_highlights_are_one_colour_and_paint_is_two(other, share, colours):
+    draw = np.random.default_rng(1)
+    paint = np.where(draw.random((4000, 1)) < share, other, (0.5, 0.1, 0.1))
+    highlights = 0.6 * draw.random((4000, 1)) ** 8
+    pixels = paint * draw.uniform(0.2, 1, (4000, 1)) * draw.lognormal(0, 0.1, (4000, 3)) + highlights
+    assert count_colours(pixels) == colours

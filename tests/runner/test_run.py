@@ -212,6 +212,15 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     assert re.search(r"^table +to run: parameter scale: default -> 3$", output, re.M)
 
 
+def test_a_run_ends_with_at_most_five_lines_of_warnings_each_of_one_fault():
+    warnings = [
+        (Step(f"stage{k}", photo), f"{photo} is odd by {n} %") for k in range(7) for n, photo in enumerate("xy")
+    ]
+    lines = display.warning_lines(warnings)
+    assert lines[0] == "warning: stage0/x: x is odd by 0 % (and 1 more: y)" and len(lines) == display.MOST_WARNINGS
+    assert lines[-1].startswith("3 more warnings: `make status`")
+
+
 def test_a_terminal_shows_a_bar_for_each_stage_and_lines_above_them(monkeypatch):
     terminal, steps = io.StringIO(), [Step("upper", "a"), Step("upper", "b")]
     terminal.isatty = lambda: True

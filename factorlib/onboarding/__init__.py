@@ -1,0 +1,1 @@
+"""Onboarding: from a folder of photographs to a dataset."""

@@ -1,0 +1,257 @@
+"""A dataset from photographs alone: `make photos DATASET=mything PHOTOS=<folder>`.
+
+Masks are alpha channels, files beside the photos, or mattes of a network.  Cameras are those in the folder, else those
+of structure from motion.  With cameras the shape is the visual hull of the masks.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from factorlib.align.silhouette import with_prior_focal
+from factorlib.dataset.paths import Refusal
+from factorlib.dataset.sources.external_cameras import READERS
+from factorlib.dataset.sources.source_image import GRID, SourceImage
+from factorlib.dataset_draft import check_target, new_dataset, photos_in
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.images.photo import box_majority, decode_photo, least_factor, open_photo
+from factorlib.images.picture import picture, write_png
+from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
+from factorlib.jsonfile import write_json
+from factorlib.labels.mask_files import read_values
+from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, alpha_matte, foreground
+from factorlib.onboarding.photo_folder import Cameras, folder_and_stem
+from factorlib.shapes.hull import agreements, focal_by_hull
+from factorlib.shapes.motion import PhotoForMotion, cameras_by_motion
+from factorlib.shapes.outline import Outline
+
+MOST_PIXELS = 1_000_000  # pixels of a photo for mattes and structure from motion
+DISAGREES = 0.8  # a mask's agreement with the hull of the others, as a share of the median one, below which it is named
+FOCAL_KEYS = ("fl_x", "camera_angle_x")
+Report = Callable[[float, str], None]
+SHAPE = (
+    "photos without known cameras do not tell the shape, and too few of them overlap to find cameras: in `meshes`, "
+    'replace `file: "?"` by `lathe: true` (a vase, a bowl, a lamp), `primitive: ball | box | cylinder`, or the path of '
+    "a mesh; or give MESHES=<folder>"
+)
+ONE_LIGHT = (
+    "one light at rest is assumed: where photos have different ones, delete `illumination: room`; where the thing "
+    "turned before a camera at rest, delete `world_from_camera: true`"
+)
+
+
+class View(msgspec.Struct, frozen=True):
+    """A photo averaged down to at most MOST_PIXELS pixels, with the mask of its foreground.
+
+    Attributes:
+        small: the photo, its mask, and its camera before any source is read
+        size: height and width of the photo's file as displayed
+        doubt: doubt of the matte, 0 for a mask that no network made
+    """
+
+    small: PhotoForMotion
+    size: tuple[int, int]
+    doubt: float
+
+    def outline(self, name: str, image: SourceImage, focal: float | None = None) -> Outline:
+        """Return the outline of the foreground with the camera of a source; `focal` replaces its focal length."""
+        camera = self.small.camera
+        scale = camera.width / (image.size[0] if image.size else self.size[1])
+        centre = (scale * image.camera.principal_point_x, scale * image.camera.principal_point_y)
+        if image.centred or image.size is None or image.size[1] is None:
+            centre = camera.centre
+        camera = Camera(camera.width, camera.height, scale * (focal or image.camera.mean_focal_length()), centre)
+        assert image.cam_from_world is not None  # the sources of a folder have a world
+        pose = Pose(image.cam_from_world.rotation.matrix(), np.array(image.cam_from_world.translation))
+        return Outline(name, self.small.objects.astype(int), camera, pose=pose)
+
+
+def dataset_from_photos(
+    target: Path, photos: Path, meshes: Path | None, model: Path | None, report: Report
+) -> tuple[list[str], list[str]]:
+    """Write the dataset of a folder of photographs, and return what is still missing, and what to look at, in words.
+
+    Args:
+        target: the folder to create
+        photos: folder of photos
+        meshes: folder of meshes; None: the shape is carved from the masks
+        model: ONNX file of a matting network; None: that of the extra `masks`
+        report: called with the completed share, from 0 to 1, and the current activity
+
+    Raises:
+        InputError: As `new_dataset` does, and if a photo needs a network that is not installed.
+    """
+    check_target(target)
+    images, masks, source = photos_in(photos)
+    cameras = Cameras()
+    outlines: list[Outline] = []
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        views = read_views(images, masks, model, folder, lambda share, text: report(share / 2, text))
+        visible = {name: view for name, view in views.items() if view.small.objects.any()}
+        if source:
+            cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
+        elif not meshes:
+            cameras, outlines = cameras_of_motion(visible, report)
+        report(0.95, "agreement of the masks")
+        doubts = doubtful_masks(views, outlines)
+        missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
+    return missing + [SHAPE] * (not cameras.source and not meshes), cameras.notes + doubts
+
+
+def read_views(
+    images: Mapping[str, Path], masks: Mapping[str, Path], model: Path | None, folder: Path, report: Report
+) -> dict[str, View]:
+    """Read the photos, and write the mask of each to masks/ in a folder, empty without a foreground.
+
+    Args:
+        images: the photos by name
+        masks: masks that lie beside them, by the stems of their names
+        model: ONNX file of a matting network; None: that of the extra `masks`
+        folder: a temporary folder
+        report: called with the completed share and the current activity
+    """
+    views: dict[str, View] = {}
+    network = None
+    (folder / "masks").mkdir()
+    for name, path in images.items():
+        report(len(views) / len(images), f"{name}: mask")
+        opened = open_photo(path, "PHOTOS")
+        check_pixels(opened.size, MOST_MEGAPIXELS, path, "PHOTOS")
+        photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), path)
+        pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
+        uncertain = 0.0
+        if file := masks.get(folder_and_stem(path.name)[1]):
+            values = read_values(file, "PHOTOS", opened.size)
+            mask = values > (127 if values.max() > 127 else 0)
+        elif (alpha := alpha_matte(path)) is not None:
+            mask = alpha > 0.5
+        else:
+            network = network or MatteModel(model)
+            matte, uncertain = network(pixels, opened.size)
+            mask = foreground(matte)
+        write_png(folder / "masks" / f"{name}.png", mask[..., None].astype(np.uint8))
+        objects = box_majority(mask, photo.factor)
+        camera = Camera(photo.width, photo.height, 1.0, (photo.width / 2, photo.height / 2))
+        prior = with_prior_focal(camera, photo.focal_px, "exif")
+        grey = pixels.mean(axis=2).astype(np.uint8)
+        views[name] = View(PhotoForMotion(grey, objects, np.zeros_like(objects), *prior), opened.size, uncertain)
+    return views
+
+
+def cameras_of_folder(
+    views: Mapping[str, View], paths: Mapping[str, Path], cameras: Cameras, folder: Path, report: Report
+) -> tuple[Cameras, list[Outline]]:
+    """Complete the cameras that lie in the folder of the photos, and return the outlines by them, too.
+
+    A focal length that is missing is that at which a hull fits the masks best.  Lenses with radial distortion become
+    the key `camera` of their photos.
+
+    Args:
+        views: the photos with a foreground
+        paths: path of each photo
+        cameras: the cameras as they lie there
+        folder: a temporary folder
+        report: called with the completed share and the current activity
+    """
+
+    def outlines(focal: float | None = None) -> list[Outline]:
+        """Return the outlines, by another focal length if it is given."""
+        return [view.outline(name, images[name], focal) for name, view in views.items() if name in images]
+
+    notes = [ONE_LIGHT]
+    content = json.loads(cameras.files[0].read_text()) if "transforms" in cameras.source else {}
+    if content and not any(key in lens for lens in (content, *content["frames"]) for key in FOCAL_KEYS):
+        height, width = next(iter(views.values())).size
+        file = folder / cameras.files[0].name
+        content |= {"fl_x": 2.0 * max(width, height), "w": width, "h": height}
+        write_json(file, content)
+        cameras = Cameras({"transforms": f"cameras/{file.name}"}, folder, [file])
+        images = match_source(paths, cameras)
+        focal = focal_by_hull(outlines, max(width, height), lambda share: report(0.5 + 0.4 * share, "focal length"))
+        write_json(file, content | {"fl_x": round(focal, 1)})
+        notes.append(f"the cameras have no focal length: a hull fits the masks best at {focal:.0f} px, which is used")
+    images = match_source(paths, cameras)
+    shared = {"illumination": "room"}
+    by_photo = {
+        name: shared | distorted_camera(images[name], view.size[1]) for name, view in views.items() if name in images
+    }
+    source = cameras.source | {"world_from_camera": True}
+    return msgspec.structs.replace(cameras, source=source, by_photo=by_photo, notes=notes), outlines()
+
+
+def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, SourceImage]:
+    """Return the image of each photo in a source of cameras, whose files are still where they lie."""
+    assert cameras.folder is not None  # a source of files
+    kind, place = next(iter(cameras.source.items()))
+    refuse = Refusal(cameras.folder, cameras.folder)
+    images = READERS[kind](place.removeprefix("cameras/"), refuse)
+    by_key = {folder_and_stem(str(image.name)): image for image in images}
+    keys = {name: folder_and_stem(str(path)) for name, path in paths.items()}
+    matches = {name: by_key.get(key) or by_key.get(("", key[1])) for name, key in keys.items()}
+    return {name: image for name, image in matches.items() if image}
+
+
+def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
+    """Return the key `camera` of a photo whose lens distorts, by least squares over its image; empty for a pinhole.
+
+    Args:
+        image: the photo's image in the source
+        width: width of the photo, pixels
+    """
+    camera = image.camera
+    if camera.is_undistorted():
+        return {}
+    centre = np.array([camera.principal_point_x, camera.principal_point_y])
+    pixels = np.indices((GRID, GRID)).reshape(2, -1).T / (GRID - 1) * [camera.width, camera.height]
+    slopes = np.asarray(camera.cam_from_img(pixels))
+    # pixel − centre = f (1 + k₁ r² + k₂ r⁴) slope, linear in f, f k₁ and f k₂
+    powers = (slopes**2).sum(axis=1, keepdims=True) ** np.arange(3)
+    design = (slopes[:, :, None] * powers[:, None]).reshape(-1, 3)
+    focal, *bends = np.linalg.lstsq(design, (pixels - centre).ravel())[0].tolist()
+    place = (width / camera.width * centre).tolist()
+    distortion = [bend / focal for bend in bends]
+    return {"camera": {"focal_px": width / camera.width * focal, "principal_point": place, "distortion": distortion}}
+
+
+def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Cameras, list[Outline]]:
+    """Return the source `sfm`, and outlines by its cameras; no source where photos do not overlap.
+
+    Args:
+        views: the photos with a foreground
+        report: called with the completed share and the current activity
+    """
+    photos = {name: view.small for name, view in views.items()}
+    try:
+        registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.4 * share, text))
+    except InputError:
+        return Cameras(), []
+    outlines = []
+    for name, each in registered.items():
+        camera = msgspec.structs.replace(photos[name].camera, focal=each.focal)
+        outlines.append(Outline(name, photos[name].objects.astype(int), camera, pose=each.pose))
+    return Cameras({"sfm": True}), outlines
+
+
+def doubtful_masks(views: Mapping[str, View], outlines: list[Outline]) -> list[str]:
+    """Name the photos whose masks are to be drawn over, with the reason.
+
+    Args:
+        views: the photos
+        outlines: outlines by known cameras
+    """
+    overlaps = agreements(outlines) if len(outlines) > 2 else []
+    groups = {
+        "its border is uncertain": [name for name, view in views.items() if view.doubt > MOST_DOUBT],
+        "it differs from what the other photos show": [
+            outline.photo for outline, each in zip(outlines, overlaps) if each < DISAGREES * np.median(overlaps)
+        ],
+    }
+    line = "draw over the mask of {} in `make label`: {}"
+    return [line.format(", ".join(names), why) for why, names in groups.items() if names]
