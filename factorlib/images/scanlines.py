@@ -156,14 +156,22 @@ def _in_display_window(rows: Rows, spec: oiio.ImageSpec) -> Rows:
 def _in_rec709(rows: Rows, spec: oiio.ImageSpec, path: str | Path) -> Rows:
     """Return the reader of rows in linear Rec. 709; colours beyond it have negative values.
 
-    Primaries are EXR's attribute `chromaticities`, Radiance's line PRIMARIES, or else Rec. 709's.
+    Primaries are EXR's attribute `chromaticities`, Radiance's line PRIMARIES, or else Rec. 709's, as where all of them
+    are 0.
     """
     with Path(path).open("rb") as stream:
         line = re.match(rb"#\?[\S\s]*?\nPRIMARIES=([^\n]*)\n", stream.read(HEADER))
     given = spec.getattribute("chromaticities") or (line[1].split() if line else REC709)
-    primaries = np.array(given, float).reshape(4, 2)
-    if np.abs(primaries - REC709).max() < SAME_CHROMATICITY:
+    try:
+        primaries = np.array(given, float).reshape(4, 2)
+    except ValueError:
+        primaries = np.full((4, 2), np.nan)
+    if not primaries.any() or np.abs(primaries - REC709).max() < SAME_CHROMATICITY:
         return rows
+    if not (primaries[:, 1] > 0).all():
+        raise InputError(
+            "its primaries are no eight chromaticities", file=path, cure="write it again without PRIMARIES"
+        )
     matrix = (np.linalg.inv(_xyz_from_rgb(REC709)) @ _xyz_from_rgb(primaries)).astype(np.float32)
     return lambda begin, end: rows(begin, end).astype(np.float32) @ matrix.T
 

@@ -124,12 +124,15 @@ def test_colours_of_other_primaries_are_rec709_and_those_of_rec709_the_same_bits
         path.write_bytes(path.read_bytes().replace(b"\nFORMAT", line))
         return read_photo(path).radiance
 
-    assert np.array_equal(read(REC709, RADIANCE), read_photo(save(tmp_path / f"b.{suffix}", RADIANCE)).radiance)
+    plain = read_photo(save(tmp_path / f"b.{suffix}", RADIANCE)).radiance
+    assert np.array_equal(read(REC709, RADIANCE), plain)
     red, white = (XYZ @ read(AP1, np.full((2, 8, 3), colour, np.float32))[0, 0] for colour in ((0.5, 0, 0), (1, 1, 1)))
     assert red / red.sum() == pytest.approx([0.713, 0.293, -0.006], abs=1e-3) and red[1] == pytest.approx(
         0.5 * 0.2722, abs=1e-3
     )
     assert white / white.sum() == pytest.approx([0.32168, 0.33767, 0.34065], abs=1e-3)
+    assert np.array_equal(read((0,) * 8, RADIANCE), plain)  # as OpenImageIO writes what it does not know
+    refusal("chromaticities", read, (0.7, -0.3, *REC709[2:]), RADIANCE)
 
 
 @pytest.mark.parametrize("left, top", [(2, 1), (-3, -2), (20, 1), (2, 13)])
