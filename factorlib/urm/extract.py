@@ -137,9 +137,11 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
         )
     normal = np.stack([maps[f"normal.{axis}"][observations.y, observations.x] for axis in "xyz"], axis=-1)
     known = (normal != 0).any(1, keepdims=True)
+    normal = np.where(known, normal, observations.normal).astype(np.float32)
+    if "detail.R" not in maps:
+        return msgspec.structs.replace(observations, normal=normal)
     detail = np.stack([maps[f"detail.{channel}"][observations.y, observations.x] for channel in "RGB"], axis=-1)
     detail = np.where(known, detail, 1.0).astype(np.float32)
-    normal = np.where(known, normal, observations.normal).astype(np.float32)
     return msgspec.structs.replace(observations, normal=normal, detail=detail)
 
 
