@@ -10,7 +10,7 @@ from factorlib.geometry.sphere import mirror_cells
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
-    *("visibility", "bounced", "confidence", "place", "row", "detail"),  # optional columns
+    *("visibility", "bounced", "confidence", "place", "row"),  # optional columns
 )
 CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
 
@@ -94,7 +94,6 @@ class Block(msgspec.Struct, frozen=True):
         confidence: Confidence of the normals, 0 to 1; None if all are equally reliable.
         place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
         row: Index of the observation among all usable ones.
-        detail: Factor on the diffuse reflectance of each observation's material, per channel; None for 1.
     """
 
     name: str
@@ -115,7 +114,6 @@ class Block(msgspec.Struct, frozen=True):
     confidence: Float[np.ndarray, " n"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
     row: Int[np.ndarray, " n"] | None = None
-    detail: Float[np.ndarray, "n 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -160,14 +158,6 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(
             self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
         )
-
-    def with_detail(self, detail: Float[np.ndarray, "n 3"]) -> Block:
-        """Return the same observations with a detail of reflectance.
-
-        The block must have no detail yet.
-        """
-        bounced = None if self.bounced is None else self.bounced * np.hstack([detail, np.ones_like(detail)])
-        return msgspec.structs.replace(self, detail=detail, bounced=bounced)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the whitened residuals of a predicted `radiance`, which is in the block's unit.

@@ -206,20 +206,14 @@ def test_patina_is_not_taken_for_dents():
     true = [on_even_cells(drawn(k, 120)) for k in range(3)]
     body, problem = surfaces(), spheres(true, size=18)
     at = [attached_to(block.normal, body) for block in problem.blocks]
-    clean = problem.with_blocks(
-        [msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks]
-    )
     point = Point(MATERIALS, in_units_of(problem.blocks, true))
-    details = []
-    for block in clean.blocks:
-        x = block.normal @ TURN
-        details.append(np.exp(0.4 * (np.sin(4 * x[:, :1]) * np.cos(3 * x[:, 1:2] + 1)) * [1.0, 0.8, -0.5]))
-    shown = clean.with_blocks([b.with_detail(d) for b, d in zip(clean.blocks, details, strict=True)]).radiance(point)
-    plain = clean.radiance(point)
-    blocks = [
-        msgspec.structs.replace(b, radiance=b.radiance * y / np.maximum(x, 1e-9))
-        for b, x, y in zip(problem.blocks, plain, shown, strict=True)
-    ]
+    blocks = []
+    for block, one in zip(problem.blocks, problem.illuminations(point), strict=True):
+        x, prediction = block.normal @ TURN, one.predict()
+        factor = np.exp(0.4 * (np.sin(4 * x[:, :1]) * np.cos(3 * x[:, 1:2] + 1)) * [1.0, 0.8, -0.5])
+        painted = prediction.radiance + (factor - 1) * one.materials.diffuse[block.material] * prediction.diffuse
+        share = painted / np.maximum(prediction.radiance, 1e-9)
+        blocks.append(msgspec.structs.replace(block, radiance=block.radiance * share))
     assert not estimate_surface(problem.with_blocks(blocks), body, at, start_from_photos(3)).evidence.accepted
 
 

@@ -6,13 +6,11 @@ import numpy as np
 from factorlib.dataset.schema import MeshEntry
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_exr
-from factorlib.inference.blocks import Noise
-from factorlib.inference.observed import blocks_of_observations, gather_observations
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.results.surface_table import SurfaceTable, read_surface
-from factorlib.stage import Inputs, serial_map, silent
+from factorlib.stage import Inputs, silent
 from factorlib.urm.extract import read_geometry, with_surface_normals
 from factorlib.urm.observations import Observations, read_observations, write_observations
 from stages import surface
@@ -31,48 +29,30 @@ def observations() -> Observations:
 
 
 def written(folder) -> None:
-    """A surface that leans to the right and is half as bright on its left half; its first row shows no mesh."""
+    """A surface that leans to the right; its first row shows no mesh."""
     normal = np.tile([0.6, 0.0, -0.8], (SIZE, SIZE, 1))
     normal[0] = 0
-    detail = np.where(np.arange(SIZE) < SIZE // 2, 0.5, 1.0) * np.ones((SIZE, 1))
-    channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {f"detail.{c}": detail for c in "RGB"}
+    channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")}
     (folder / "photos").mkdir(parents=True)
     write_exr(folder / "photos" / "a.exr", channels)
 
 
-def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tmp_path):
+def test_observations_and_maps_have_the_normals_of_the_surface(tmp_path):
     written(tmp_path / "surface")
     observed = with_surface_normals(observations(), tmp_path / "surface")
     first = observed.y == 0
     np.testing.assert_allclose(observed.normal[~first], np.tile([0.6, 0, -0.8], ((~first).sum(), 1)), atol=1e-6)
-    assert (observed.normal[first] == [0, 0, -1]).all() and (observed.detail[first] == 1).all()
-    assert (observed.detail[~first & (observed.x < 6)] == 0.5).all() and (observed.detail[observed.x >= 6] == 1).all()
+    assert (observed.normal[first] == [0, 0, -1]).all()
     (tmp_path / "align").mkdir()
     write_exr(
         tmp_path / "align" / "a.exr",
         {f"normal.{a}": np.ones((SIZE, SIZE)) for a in "xyz"} | {"depth": np.ones((SIZE, SIZE))},
     )
     maps = read_geometry(tmp_path / "align", tmp_path / "surface", "a")
-    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", *(f"detail.{c}" for c in "RGB")}
+    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth"}
     assert maps["normal.x"][3, 3] == np.float32(0.6)
-    assert "detail.R" not in read_geometry(tmp_path / "align", None, "a")
-    assert (
-        with_surface_normals(observations(), None) is not None
-        and with_surface_normals(observations(), None).detail is None
-    )
     wide = msgspec.structs.replace(observations(), x=observations().x + 1)
     refusal("12 × 12", with_surface_normals, wide, tmp_path / "surface")
-
-
-def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(tmp_path):
-    written(tmp_path / "surface")
-    write_observations(tmp_path / "a.parquet", observations())
-    (photo,) = gather_observations([tmp_path / "a.parquet"], 2.0, serial_map, tmp_path / "surface")
-    assert np.unique(photo.merged.detail).tolist() == [0.5, 1.0]
-    (block,) = blocks_of_observations(photo.merged, Noise())
-    assert np.array_equal(np.sort(block.detail, 0), np.sort(photo.merged.detail, 0))
-    plain = msgspec.structs.replace(photo.merged, detail=None)
-    assert blocks_of_observations(plain, Noise())[0].detail is None
 
 
 def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
