@@ -9,10 +9,11 @@ factor at node v, and b are barycentric coordinates.  So z_i = (y_i − S_i)/(k_
 
     Σ_i w_i ρ(z_i − t_i) + a Σ_edges |f_v − f_w|² + ε Σ_v |f_v − 1|²                                                 (2)
 
-with ρ the pseudo-Huber loss, by reweighted least squares.  Errors of D are relative to it, and those of y are not: w =
-cosine · x²/(x² + d²), x the mean of k_d D over channels and d the share `DARK` of the mean of k_d D + S over the
-material's pixels in the photo.  A metal thus observes no paint.  Nodes that no pixel shows continue the ones around
-them.
+with ρ the pseudo-Huber loss, by reweighted least squares.  Errors of D are relative to it, and those of y are not: a
+channel has the weight x²/(x² + d²), x = k_d D and d the share `DARK` of the mean of k_d D + S over the material's pixels
+in the photo.  z of a channel is its own by its weight, and else the weighted mean of all channels, which a channel too
+dark to observe paint follows.  w is the largest of the three weights, times the cosine.  A metal thus observes no
+paint.  Nodes that no pixel shows continue the ones around them.
 
 Evidence    Each photo is predicted by the texture of others, a fold of photos at a time, where these see its surface.
             The stiffness a with the least loss is used.  The texture is kept if it predicts better than the best flat

@@ -99,6 +99,13 @@ def test_a_metal_observes_no_paint():
     assert (samples.weight < 1e-6).all()
 
 
+def test_a_channel_too_dark_to_observe_paint_follows_the_others():
+    diffuse, shine, factor = np.tile([0.5, 1e-3, 0.5], (4, 1)), np.full((4, 3), 0.05), np.array([0.5, 0.8, 1.0, 1.5])
+    radiance = factor[:, None] * diffuse + shine + 0.002  # an error of the highlight
+    samples = observe_texture(radiance, diffuse, shine, np.ones(4), (csr_array(np.eye(4)), np.arange(4)))
+    np.testing.assert_allclose(samples.ratio, np.tile(factor[:, None], 3), atol=0.02)
+
+
 def test_paint_that_nobody_sees_is_not_kept():
     samples = [pixels(PAINT**0.05, seed, noise=0.01) for seed in range(3)]
     factor, evidence, _ = select_texture(samples, LAPLACIAN)
