@@ -10,10 +10,10 @@ factor at node v, and b are barycentric coordinates.  So z_i = (y_i − S_i)/(k_
     Σ_i w_i ρ(z_i − t_i) + a Σ_edges |f_v − f_w|² + ε Σ_v |f_v − 1|²                                                 (2)
 
 with ρ the pseudo-Huber loss, by reweighted least squares.  Errors of D are relative to it, and those of y are not: a
-channel has the weight x²/(x² + d²), x = k_d D and d the share `DARK` of the mean of k_d D + S over the material's pixels
-in the photo.  z of a channel is its own by its weight, and else the weighted mean of all channels, which a channel too
-dark to observe paint follows.  w is the largest of the three weights, times the cosine.  A metal thus observes no
-paint.  Nodes that no pixel shows continue the ones around them.
+channel has the weight x²/(x² + d²), x = k_d D and d the share `DARK` of the mean of k_d D + S over the material's
+pixels in the photo.  w is the largest of the three weights, times the cosine.  A metal thus observes no paint.  A
+channel too dark to observe paint follows the others: its z is its own by the share x⁴/(x⁴ + d⁴), and for the rest the
+weighted mean of all channels.  Nodes that no pixel shows continue the ones around them.
 
 Evidence    Each photo is predicted by the texture of others, a fold of photos at a time, where these see its surface.
             The stiffness a with the least loss is used.  The texture is kept if it predicts better than the best flat
@@ -90,9 +90,10 @@ def observe_texture(
     dark = DARK * max(float((diffuse + specular).mean()), 1e-12) if len(diffuse) else 1.0
     weight = diffuse**2 / (diffuse**2 + dark**2)
     ratio = ((radiance - specular) / np.maximum(diffuse, 1e-3 * dark)).clip(0, LARGEST_RATIO)
-    # z̄, which channels too dark to observe follow
+    # z̄, which channels too dark to observe paint follow
     mean = (weight * ratio).sum(1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
-    ratio = weight * ratio + (1 - weight) * mean
+    own = diffuse**4 / (diffuse**4 + dark**4)
+    ratio = own * ratio + (1 - own) * mean
     return TextureSamples(positions[0], ratio, cosine * weight.max(1), positions[1])
 
 
