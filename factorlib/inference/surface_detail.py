@@ -56,7 +56,7 @@ from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.results.materials import Decision
 
 # a of `factorlib.inference.surface_turns`; b is a share of it.
-TURN_STIFFNESSES = (1000.0, 100.0, 10.0)
+TURN_STIFFNESSES = (1000.0, 300.0, 100.0, 30.0, 10.0)
 ROUNDS = 3
 CELLS = 250  # cells of a light
 FOLDS = 4  # folds of photos
