@@ -38,13 +38,13 @@ from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.labels.label_image import read_labels
 from factorlib.labels.mask_files import (
     BACKGROUND,
-    is_cut_out,
     read_annotations,
     read_inside,
     read_labelmap,
     read_labels_in,
 )
 from factorlib.meshes.read_mesh import read_mesh, read_parts
+from factorlib.onboarding.matte import opaque_pixels
 from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder
 from factorlib.reading import reading
 from factorlib.wholefile import disk_error, write_text
@@ -298,7 +298,7 @@ def _cut_outs(photos: Mapping[str, str], images: Mapping[str, Path], missing: li
     for name, path in images.items():
         with suppress(InputError):  # `validate` reports a photo that cannot be read
             check_pixels(open_photo(path).size, MOST_MEGAPIXELS, path)
-            if path.suffix.lower() == ".png" and is_cut_out(path, name):
+            if path.suffix.lower() == ".png" and opaque_pixels(path) is not None:
                 masks.by_photo[name] = photos[name]
                 masks.materials = ["label_1"]
     _name_outlines(masks, list(masks.by_photo), missing)
