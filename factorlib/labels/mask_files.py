@@ -229,7 +229,6 @@ class Annotation(msgspec.Struct, frozen=True):
     image_id: int | str
     category_id: int | str
     segmentation: msgspec.Raw = msgspec.Raw(b"null")
-    id: int | str | None = None
 
 
 class Category(msgspec.Struct, frozen=True):
@@ -439,7 +438,7 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
     if isinstance(segmentation, Rle):
         if tuple(segmentation.size) != shape:
             raise InputError(
-                f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}",
+                f"its RLE is {segmentation.size[1]} × {segmentation.size[0]} pixels, the image {shape[1]} × {shape[0]}",
                 file=path,
                 key=key,
                 cure="export it at the photo's own size",
@@ -458,7 +457,7 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         if len(corners) % 2 or not np.isfinite(corners).all():
             fault = "is not a polygon"
         elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
-            fault = f"has corners outside the image of {_wh(shape)} pixels"
+            fault = f"has corners outside the image of {shape[1]} × {shape[0]} pixels"
             cure = "clip it to the image; if it was drawn at another size, export it at the photo's own size"
         else:
             corners = np.clip(corners, 0, limit)
@@ -472,8 +471,3 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         length += longer
     runs = pycocomask.frPyObjects(polygons, *shape) if polygons else []
     return [each["counts"].decode("ascii") for each in runs], length
-
-
-def _wh(shape: tuple[int, int]) -> str:
-    """Format a size as width × height."""
-    return f"{shape[1]} × {shape[0]}"

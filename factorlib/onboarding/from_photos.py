@@ -16,7 +16,7 @@ import numpy as np
 
 from factorlib.align.silhouette import with_prior_focal
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.sources.external_cameras import READERS
+from factorlib.dataset.sources.external_cameras import READERS, match_images
 from factorlib.dataset.sources.source_image import GRID, SourceImage
 from factorlib.dataset_draft import check_target, new_dataset, photos_in
 from factorlib.errors import InputError
@@ -197,10 +197,7 @@ def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, Sourc
     kind, place = next(iter(cameras.source.items()))
     refuse = Refusal(cameras.folder, cameras.folder)
     images = READERS[kind](place.removeprefix("cameras/"), refuse)
-    by_key = {folder_and_stem(str(image.name)): image for image in images}
-    keys = {name: folder_and_stem(str(path)) for name, path in paths.items()}
-    matches = {name: by_key.get(key) or by_key.get(("", key[1])) for name, key in keys.items()}
-    return {name: image for name, image in matches.items() if image}
+    return match_images({name: str(path) for name, path in paths.items()}, {}, kind, images, refuse)
 
 
 def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
