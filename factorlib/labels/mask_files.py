@@ -142,10 +142,10 @@ def read_colours(
 
 def read_labelmap(path: Path) -> dict[int, str]:
     """Return the names in a labelmap.txt of CVAT by their colours, 0xRRGGBB."""
-    lines = [line.split(":") for line in read_text(path, "a labelmap", None, MOST_BYTES).splitlines()]
+    lines = read_text(path, "a labelmap", None, MOST_BYTES).splitlines()
+    rows = [line.split(":") for line in lines if line.strip() and not line.startswith("#")]
     with reading("a labelmap", path, cure="its lines are name:red,green,blue::"):
-        rows = [(name, bytes(map(int, colour.split(",")))) for name, colour, *_ in lines if not name.startswith("#")]
-        return {int.from_bytes(colour): name for name, colour in rows}
+        return {int.from_bytes(bytes(map(int, colour.split(",")))): name for name, colour, *_ in rows}
 
 
 class _Png(msgspec.Struct, frozen=True):

@@ -86,7 +86,7 @@ def labelme(folder, shapes, size=(H, W)):
 def cvat(folder, mode):
     (folder / "m/SegmentationClass").mkdir(parents=True)
     (folder / "m/labelmap.txt").write_text(
-        "# label:color_rgb:parts:actions\nbackground:0,0,0::\nred:250,250,0::\nwood:0,0,77::\n"
+        "# label:color_rgb:parts:actions\nbackground:0,0,0::\n\nred:250,250,0::\nwood:0,0,77::\n"
     )
     colours = np.array([[0, 0, 0], [250, 250, 0], [9, 9, 9], [0, 0, 77]], np.uint8)
     Image.fromarray(colours[LABEL]).convert(mode, palette=Image.Palette.ADAPTIVE).save(
