@@ -80,11 +80,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
 
 
 def match_images(
-    paths: Mapping[str, str],
-    chosen: Mapping[str, str | int],
-    kind: str,
-    images: list[SourceImage],
-    refuse: Refusal,
+    paths: Mapping[str, str], chosen: Mapping[str, str | int], kind: str, images: list[SourceImage], refuse: Refusal
 ) -> dict[str, SourceImage]:
     """Match the photos to images of the source.
 
