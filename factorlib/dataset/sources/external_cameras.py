@@ -82,7 +82,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
 def match_images(
     paths: Mapping[str, str], chosen: Mapping[str, str | int], kind: str, images: list[SourceImage], refuse: Refusal
 ) -> dict[str, SourceImage]:
-    """Match the photos to images of the source.
+    """Return the image of the source for each photo that has one.
 
     The match is by choice, else by path, by file name, or by file name without suffix; for BOP it is by id.
 
@@ -92,9 +92,6 @@ def match_images(
         kind: kind of the source
         images: images of the source
         refuse: raises errors
-
-    Returns:
-        The matching image by photo.
     """
     by_name = {image.name: image for image in images}
     by_pattern: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
@@ -108,9 +105,8 @@ def match_images(
         key = f"cameras.images.{photo}"
         if photo in chosen:
             name = chosen[photo]
-            refuse.refuse_if(
-                name not in by_name, key, f"the source has no image {name!r}", did_you_mean(str(name), by_name)
-            )
+            cure = did_you_mean(str(name), by_name)
+            refuse.refuse_if(name not in by_name, key, f"the source has no image {name!r}", cure)
             result[photo] = by_name[name]
             continue
         matches = ([image for pattern in each for image in by_pattern.get(pattern, [])] for each in _patterns(place))
