@@ -3,9 +3,8 @@
 The files are copied to data/<name>/.  A mask belongs to the photo of the same name: `kitchen.png` with labels,
 `kitchen_oak.png` or `kitchen/oak.png` for one material, `kitchen.json` of labelme, one COCO json for all, or CVAT's
 masks with labelmap.txt.  A `kitchen.png` without labels, or the alpha of a photo, is the silhouette of one material.
-Beside a mask with labels,
-`kitchen_chair1.png` is the silhouette of an object.  Materials are the names in those, or label_1, label_2, … for
-labels.
+Beside a mask with labels, `kitchen_chair1.png` is the silhouette of an object.  Materials are the names in those, or
+label_1, label_2, … for labels.
 
 The labels of a mesh's parts are found by comparing the mesh with the masks under every pairing.  The draft states the
 margin of the best one.  Values that no file determines, and uncertain pairings, are left as `?`, which `make validate`
@@ -24,7 +23,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from PIL import Image
 
 from factorlib.align.coarse import HIDDEN, match_parts
 from factorlib.align.silhouette import UNKNOWN as HIDES
@@ -34,19 +32,18 @@ from factorlib.dataset.read_dataset import UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME
 from factorlib.errors import InputError
 from factorlib.images.photo import open_photo
-from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
+from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
 from factorlib.labels.label_image import read_labels
 from factorlib.labels.mask_files import (
     BACKGROUND,
-    is_cut_out,
     read_annotations,
     read_inside,
     read_labelmap,
     read_labels_in,
 )
 from factorlib.meshes.read_mesh import read_mesh, read_parts
+from factorlib.onboarding.matte import opaque_pixels
 from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder
-from factorlib.reading import reading
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
 
@@ -76,6 +73,7 @@ NO_MASKS = (
     "or give MASKS=<folder>"
 )
 
+NO_MASK = "photo {0}: no mask called {0}.png or {0}_<material>.png"
 NO_MATERIAL = "no mask names a material: write the names in `materials`, label k of a mask the k-th"
 RESERVED = "photo {0}: write another `name`: a file of the results is called {0}"
 
@@ -128,7 +126,8 @@ def new_dataset(
     labelled = _masks(masks, mask_files, list(images), missing) if masks else _cut_outs(paths, images, missing)
     entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
-    missing += _missing_masks(list(images), labelled) if masks or labelled.by_photo else [NO_MASKS]
+    unmasked = [NO_MASK.format(photo) for photo in images if photo not in labelled.by_photo]
+    missing += unmasked if masks or labelled.by_photo else [NO_MASKS]
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
         missing += [] if cameras or source else [NO_MESH]
@@ -186,12 +185,6 @@ def _visible_meshes(
     return visible
 
 
-def _missing_masks(photos: list[str], labelled: Masks) -> list[str]:
-    """List the photos without a mask."""
-    without = [photo for photo in photos if photo not in labelled.by_photo]
-    return [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png" for photo in without]
-
-
 def _shape(materials: list[str], cameras: Cameras) -> dict[str, Any]:
     """Return the entry of a mesh without a file: a hull, or open where no cameras are known."""
     parts = {"parts": {name: name for name in materials}} if len(materials) > 1 else {"material": materials[0]}
@@ -222,20 +215,16 @@ def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[P
         with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
             draft = Path(folder) / target.name
             for name, (source, files) in places.items():
-                _copy(source, draft / name, files)
+                for path in files:
+                    place = draft / name / path.relative_to(source)
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(path, place)
             write_text(draft / "dataset.yaml", REMARK + text)
             draft.rename(target)
     except OSError as error:
         cure = "name another folder for the dataset"
         known = disk_error(error, target.parent)
         raise known or InputError("no folder can be created here", file=above, key="DATASET", cure=cure) from error
-
-
-def _copy(source: Path, target: Path, files: Iterable[Path]) -> None:
-    for path in files:
-        place = target / path.relative_to(source)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, place)
 
 
 def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str]) -> Masks:
@@ -251,7 +240,8 @@ def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str
     for photo in photos:
         each = {name: file[path] for name, path in sorted(further[photo].items())}
         if photo in whole:
-            values = _labels_in(whole[photo], photo)
+            check_values(whole[photo], key=photo)
+            values = read_labels_in(whole[photo], photo)
             labels = max([labels, *values])
             outlines += [photo] * (not values)
             masks.by_photo[photo] = file[whole[photo]]
@@ -298,7 +288,7 @@ def _cut_outs(photos: Mapping[str, str], images: Mapping[str, Path], missing: li
     for name, path in images.items():
         with suppress(InputError):  # `validate` reports a photo that cannot be read
             check_pixels(open_photo(path).size, MOST_MEGAPIXELS, path)
-            if path.suffix.lower() == ".png" and is_cut_out(path, name):
+            if path.suffix.lower() == ".png" and opaque_pixels(path) is not None:
                 masks.by_photo[name] = photos[name]
                 masks.materials = ["label_1"]
     _name_outlines(masks, list(masks.by_photo), missing)
@@ -338,14 +328,6 @@ def _masks_by_photo(
         elif path.parent.parent == folder and path.parent.name in further:
             further[path.parent.name][name] = path
     return whole, further
-
-
-def _labels_in(path: Path, photo: str) -> set[int]:
-    """Return the labels in a mask.  Raises InputError for a file that is not a PNG or too large."""
-    with reading("a PNG", path, photo, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as png:
-        size = png.size
-    check_pixels(size, MOST_MEGAPIXELS, path, photo)
-    return read_labels_in(path, photo)
 
 
 def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict[str, Any]]:

@@ -64,18 +64,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     entry = f"photos[{name}]"
     opened = open_photo(path, f"{entry}.image")
     height, width = opened.size
-    key = f"{entry}.masks"
     check_pixels(opened.size, params.most_megapixels, path, f"{entry}.image")
     progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
-    labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, key)
+    labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, f"{entry}.masks")
     object_masks = [(o.name, o.mask) for o in facts.objects]
     objects = read_object_indices(object_masks, inputs.file, opened.size, f"{entry}.objects")
     # smallest integer factor at which materials and frame fit their limits
-    factor = max(
-        least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame)
-    )
-    factor = min(factor, height, width)
-    labels = reduce_labels(labels, factor, path, key)
+    factor = least_factor(int(np.count_nonzero(labels.label)), params.pixels)
+    factor = min(max(factor, least_factor(height * width, params.frame)), height, width)
+    labels = reduce_labels(labels, factor, path, f"{entry}.masks")
     objects = box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
     photo = decode_photo(opened, facts.encoding, factor, path)

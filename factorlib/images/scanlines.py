@@ -26,12 +26,13 @@ import OpenImageIO as oiio
 from jaxtyping import Bool, Shaped
 
 from factorlib.errors import InputError
-from factorlib.reading import one_line
+from factorlib.reading import one_line, reading
 
 CLIPPED = 0.995  # least share of the white code that is clipped: JPEG compression disturbs the top code a little
 WHITE = {oiio.UINT8: 2**8 - 1, oiio.UINT16: 2**16 - 1, oiio.UINT32: 2**32 - 1}
 REC709 = np.array([[0.64, 0.33], [0.3, 0.6], [0.15, 0.06], [0.3127, 0.329]])  # red, green, blue, white: x, y
 SAME_CHROMATICITY = 1e-3  # primaries that differ by less are the same
+LARGEST_GAIN = 100.0  # greatest factor between primaries; damaged ones have more
 HEADER = 4096  # number of bytes that hold the header of a Radiance file
 COPY = "copy it again from its source"
 log = logging.getLogger("factorlib.images")
@@ -157,30 +158,26 @@ def _in_rec709(rows: Rows, spec: oiio.ImageSpec, path: str | Path) -> Rows:
     """Return the reader of rows in linear Rec. 709; colours beyond it have negative values.
 
     Primaries are EXR's attribute `chromaticities`, Radiance's line PRIMARIES, or else Rec. 709's, as where all of them
-    are 0.
+    are 0. They need not be colours: ACES' blue has a negative y.
     """
     with Path(path).open("rb") as stream:
         line = re.match(rb"#\?[\S\s]*?\nPRIMARIES=([^\n]*)\n", stream.read(HEADER))
     given = spec.getattribute("chromaticities") or (line[1].split() if line else REC709)
-    try:
+    with reading("eight chromaticities of primaries", path, cure="write it again without them"):
         primaries = np.array(given, float).reshape(4, 2)
-    except ValueError:
-        primaries = np.full((4, 2), np.nan)
-    if not primaries.any() or np.abs(primaries - REC709).max() < SAME_CHROMATICITY:
-        return rows
-    if not (primaries[:, 1] > 0).all():
-        raise InputError(
-            "its primaries are no eight chromaticities", file=path, cure="write it again without PRIMARIES"
-        )
-    matrix = (np.linalg.inv(_xyz_from_rgb(REC709)) @ _xyz_from_rgb(primaries)).astype(np.float32)
+        if not primaries.any() or np.abs(primaries - REC709).max() < SAME_CHROMATICITY:
+            return rows
+        matrix = (np.linalg.inv(_xyz_from_rgb(REC709)) @ _xyz_from_rgb(primaries)).astype(np.float32)
+        if not np.abs(matrix).max() < LARGEST_GAIN:
+            raise ValueError("they span no colours")
     return lambda begin, end: rows(begin, end).astype(np.float32) @ matrix.T
 
 
 def _xyz_from_rgb(primaries: Shaped[np.ndarray, "4 2"]) -> Shaped[np.ndarray, "3 3"]:
     """Return the matrix of primaries whose sum is white of luminance 1."""
     x, y = primaries.T
-    xyz = np.stack([x, y, 1 - x - y]) / y
-    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
+    xyz = np.stack([x, y, 1 - x - y])
+    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3] / y[3])
 
 
 def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[int]:

@@ -209,7 +209,8 @@ def _merged(
             fault = f"materials {materials[claimed - 1]!r} and {material!r} share {int(shared.sum())} pixels"
             fault += f" with {other_path.name}" if other_path != path else ""
             square = (edge + 1, edge + 1)
-            if edge and (shared == inside[material]).all():  # drawn on a larger one, whose outline does not spare it
+            within = (shared == inside[material]).all() and shared.sum() < inside[materials[claimed - 1]].sum()
+            if edge and within:  # drawn on a larger one, whose outline does not spare it
                 log.warning("%s: %s: %s: %r is in front", path, key, fault, material)
                 continue
             if min(shared.shape) > edge and sliding_window_view(shared, square).all((2, 3)).any():

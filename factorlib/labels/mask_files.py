@@ -60,8 +60,7 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
     Raises:
         InputError: If the file is not such a PNG, or has another size.
     """
-    pixels, depth, colour_type = _decode(path, key, size)
-    return _values(pixels, depth, colour_type, path, key)
+    return _values(_decode(path, key, size), path, key)
 
 
 def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
@@ -78,24 +77,35 @@ def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None)
     Returns:
         A mask.
     """
-    pixels, depth, colour_type = _decode(path, key, size)
-    alpha = _transparency(pixels)
-    values = _values(pixels, depth, colour_type, path, key) if alpha is None else alpha
+    png = _decode(path, key, size)
+    if png.opaque is not None:
+        return png.opaque
+    values = _values(png, path, key)
     return values > values.max() // 2  # in the values' own type, of which twice the greatest may be no number
 
 
-def read_labels_in(path: str | Path, key: str) -> set[int]:
-    """Return the labels in a PNG; none if it is a silhouette: transparency, 0 and 255 alone, or many greys."""
-    pixels, depth, colour_type = _decode(path, key, None)
-    if _transparency(pixels) is not None:
+def read_labels_in(path: str | Path, key: str, size: tuple[int, int] | None = None) -> set[int]:
+    """Return the labels in a PNG; none if it is a silhouette: transparency, 0 and 255 alone, or mostly bright greys.
+
+    Args:
+        path: File.
+        key: Key to name in errors.
+        size: Expected height and width.
+    """
+    png = _decode(path, key, size)
+    if png.opaque is not None and (png.pixels.ndim == 3 or png.pixels.max() > LARGEST_LABEL):
         return set()
-    values = set(np.unique(_values(pixels, depth, colour_type, path, key)).tolist()) - {0, LEFT_OUT}
-    return set() if max(values, default=0) > LARGEST_LABEL else values
+    values = _values(png, path, key)
+    present = set(np.unique(values).tolist()) - {0, LEFT_OUT}
+    bright = 2 * np.count_nonzero(values > LEFT_OUT // 2) >= np.count_nonzero(values)
+    is_matte = bright and max(present, default=0) > LARGEST_LABEL
+    return set() if is_matte else {label for label in present if label < LEFT_OUT}
 
 
-def is_cut_out(path: Path, key: str) -> bool:
-    """Return True if a PNG has transparent pixels."""
-    return _transparency(_decode(path, key, None)[0]) is not None
+def opaque_part(alpha: np.ndarray) -> Bool[np.ndarray, "h w"] | None:
+    """Return the mask of an alpha channel of integers, cut at half; None if it is the same everywhere."""
+    opaque = alpha > alpha.max() // 2
+    return opaque if opaque.any() and not opaque.all() else None
 
 
 def read_colours(
@@ -132,41 +142,45 @@ def read_colours(
 
 def read_labelmap(path: Path) -> dict[int, str]:
     """Return the names in a labelmap.txt of CVAT by their colours, 0xRRGGBB."""
-    lines = [line.split(":") for line in read_text(path, "a labelmap", None, MOST_BYTES).splitlines()]
+    lines = read_text(path, "a labelmap", None, MOST_BYTES).splitlines()
+    rows = [line.split(":") for line in lines if line.strip() and not line.startswith("#")]
     with reading("a labelmap", path, cure="its lines are name:red,green,blue::"):
-        rows = [(name, bytes(map(int, colour.split(",")))) for name, colour, *_ in lines if not name.startswith("#")]
-        return {int.from_bytes(colour): name for name, colour in rows}
+        return {int.from_bytes(bytes(map(int, colour.split(",")))): name for name, colour, *_ in rows}
 
 
-def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> tuple[np.ndarray, int, int]:
-    """Return the pixels of a PNG as Pillow decodes them, its bit depth and its colour type."""
+class _Png(msgspec.Struct, frozen=True):
+    """A PNG as Pillow decodes it, with its bit depth and colour type; `opaque` is None if no pixel is transparent."""
+
+    pixels: np.ndarray
+    opaque: np.ndarray | None
+    depth: int
+    colour_type: int
+
+
+def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Png:
+    """Decode a PNG, and check its size."""
     check_plain(path, "a PNG", key)
     with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:
         check_size(image.size[::-1], size or image.size[::-1], path, key)
         pixels = np.asarray(image)
-    with Path(path).open(
-        "rb"
-    ) as stream:  # bit depth and colour type, after signature, IHDR's length and name, and size
+        has_alpha = image.mode in ("P", "LA", "RGBA") and image.has_transparency_data
+        opaque = opaque_part(np.asarray(image.convert("RGBA"))[..., 3]) if has_alpha else None
+    with Path(path).open("rb") as stream:  # after signature, IHDR's length and name, and size
         depth, colour_type = stream.read(26)[24:26]
-    return pixels, depth, colour_type
+    return _Png(pixels, opaque, depth, colour_type)
 
 
-def _transparency(pixels: np.ndarray) -> np.ndarray | None:
-    """Return the alpha of a picture, None if it has none, or an opaque one."""
-    alpha = pixels[..., -1] if pixels.ndim == 3 and pixels.shape[-1] in (2, 4) else None
-    return None if alpha is None or (alpha == np.iinfo(alpha.dtype).max).all() else alpha
-
-
-def _values(values: np.ndarray, depth: int, colour_type: int, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
+def _values(png: _Png, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
     """Return the stored values of a decoded PNG; InputError for colours and transparency."""
     fault = None
-    if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow keeps only the upper byte
+    values = png.pixels
+    if png.depth == 16 and png.colour_type not in (_GREY, _PALETTE):  # Pillow keeps only the upper byte
         fault = "has several channels of 16 bits"
         cure = "save labels in one channel of 8 bits"
     elif values.ndim == 3:
         colours = values[..., : 1 if values.shape[-1] == 2 else 3]
         coloured = (colours != colours[..., :1]).any(axis=-1)
-        if _transparency(values) is not None:
+        if png.opaque is not None:
             fault = "has transparent pixels"
             cure = "save it without alpha: 0 is background; or, if it shows one material, write masks: {material: file}"
         elif coloured.any():
@@ -175,7 +189,7 @@ def _values(values: np.ndarray, depth: int, colour_type: int, path: str | Path, 
         values = colours[..., 0]
     if fault:
         raise InputError(fault, file=path, key=key, cure=cure)
-    return (values // (_STRETCH.get(depth, 1) if colour_type == _GREY else 1)).astype(np.uint16)
+    return (values // (_STRETCH.get(png.depth, 1) if png.colour_type == _GREY else 1)).astype(np.uint16)
 
 
 def check_size(size: Sequence[float], expected: Sequence[int], path: str | Path, key: str) -> None:
@@ -215,7 +229,6 @@ class Annotation(msgspec.Struct, frozen=True):
     image_id: int | str
     category_id: int | str
     segmentation: msgspec.Raw = msgspec.Raw(b"null")
-    id: int | str | None = None
 
 
 class Category(msgspec.Struct, frozen=True):
@@ -425,7 +438,7 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
     if isinstance(segmentation, Rle):
         if tuple(segmentation.size) != shape:
             raise InputError(
-                f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}",
+                f"its RLE is {segmentation.size[1]} × {segmentation.size[0]} pixels, the image {shape[1]} × {shape[0]}",
                 file=path,
                 key=key,
                 cure="export it at the photo's own size",
@@ -444,7 +457,7 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         if len(corners) % 2 or not np.isfinite(corners).all():
             fault = "is not a polygon"
         elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
-            fault = f"has corners outside the image of {_wh(shape)} pixels"
+            fault = f"has corners outside the image of {shape[1]} × {shape[0]} pixels"
             cure = "clip it to the image; if it was drawn at another size, export it at the photo's own size"
         else:
             corners = np.clip(corners, 0, limit)
@@ -458,8 +471,3 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         length += longer
     runs = pycocomask.frPyObjects(polygons, *shape) if polygons else []
     return [each["counts"].decode("ascii") for each in runs], length
-
-
-def _wh(shape: tuple[int, int]) -> str:
-    """Format a size as width × height."""
-    return f"{shape[1]} × {shape[0]}"

@@ -6,6 +6,7 @@ of structure from motion.  With cameras the shape is the visual hull of the mask
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 
 from factorlib.align.silhouette import with_prior_focal
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.sources.external_cameras import READERS
+from factorlib.dataset.sources.external_cameras import READERS, match_images
 from factorlib.dataset.sources.source_image import GRID, SourceImage
 from factorlib.dataset_draft import check_target, new_dataset, photos_in
 from factorlib.errors import InputError
@@ -24,8 +25,8 @@ from factorlib.images.photo import box_majority, decode_photo, least_factor, ope
 from factorlib.images.picture import picture, write_png
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
-from factorlib.labels.mask_files import read_values
-from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, alpha_matte, foreground
+from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
+from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
 from factorlib.onboarding.photo_folder import Cameras, folder_and_stem
 from factorlib.shapes.hull import agreements, focal_by_hull
 from factorlib.shapes.motion import PhotoForMotion, cameras_by_motion
@@ -33,6 +34,7 @@ from factorlib.shapes.outline import Outline
 
 MOST_PIXELS = 1_000_000  # pixels of a photo for mattes and structure from motion
 DISAGREES = 0.8  # a mask's agreement with the hull of the others, as a share of the median one, below which it is named
+LENS_ERROR = 0.005  # greatest error of a lens by two coefficients, in widths of the image
 FOCAL_KEYS = ("fl_x", "camera_angle_x")
 Report = Callable[[float, str], None]
 SHAPE = (
@@ -95,6 +97,9 @@ def dataset_from_photos(
         folder = Path(temporary)
         views = read_views(images, masks, model, folder, lambda share, text: report(share / 2, text))
         visible = {name: view for name, view in views.items() if view.small.objects.any()}
+        if not visible:
+            cure = "draw masks: `make new`, then `make label`"
+            raise InputError("no photo has a foreground", file=photos, key="PHOTOS", cure=cure)
         if source:
             cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
         elif not meshes:
@@ -128,10 +133,10 @@ def read_views(
         pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
         uncertain = 0.0
         if file := masks.get(folder_and_stem(path.name)[1]):
-            values = read_values(file, "PHOTOS", opened.size)
-            mask = values > (127 if values.max() > 127 else 0)
-        elif (alpha := alpha_matte(path)) is not None:
-            mask = alpha > 0.5
+            labels = list(read_labels_in(file, "PHOTOS", opened.size))
+            mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
+        elif (opaque := opaque_pixels(path)) is not None:
+            mask = opaque
         else:
             network = network or MatteModel(model)
             matte, uncertain = network(pixels, opened.size)
@@ -192,14 +197,13 @@ def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, Sourc
     kind, place = next(iter(cameras.source.items()))
     refuse = Refusal(cameras.folder, cameras.folder)
     images = READERS[kind](place.removeprefix("cameras/"), refuse)
-    by_key = {folder_and_stem(str(image.name)): image for image in images}
-    keys = {name: folder_and_stem(str(path)) for name, path in paths.items()}
-    matches = {name: by_key.get(key) or by_key.get(("", key[1])) for name, key in keys.items()}
-    return {name: image for name, image in matches.items() if image}
+    return match_images({name: str(path) for name, path in paths.items()}, {}, kind, images, refuse)
 
 
 def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
-    """Return the key `camera` of a photo whose lens distorts, by least squares over its image; empty for a pinhole.
+    """Return the key `camera` of a photo whose lens distorts, by least squares over its image.
+
+    It is empty for a pinhole, and for a lens that two coefficients do not describe, which `validate` refuses.
 
     Args:
         image: the photo's image in the source
@@ -214,7 +218,12 @@ def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
     # pixel − centre = f (1 + k₁ r² + k₂ r⁴) slope, linear in f, f k₁ and f k₂
     powers = (slopes**2).sum(axis=1, keepdims=True) ** np.arange(3)
     design = (slopes[:, :, None] * powers[:, None]).reshape(-1, 3)
-    focal, *bends = np.linalg.lstsq(design, (pixels - centre).ravel())[0].tolist()
+    offsets = (pixels - centre).ravel()
+    if not np.isfinite(design).all():  # pixels without a ray
+        return {}
+    focal, *bends = (solution := np.linalg.lstsq(design, offsets)[0]).tolist()
+    if np.abs(design @ solution - offsets).max() > LENS_ERROR * camera.width:
+        return {}
     place = (width / camera.width * centre).tolist()
     distortion = [bend / focal for bend in bends]
     return {"camera": {"focal_px": width / camera.width * focal, "principal_point": place, "distortion": distortion}}
@@ -246,7 +255,9 @@ def doubtful_masks(views: Mapping[str, View], outlines: list[Outline]) -> list[s
         views: the photos
         outlines: outlines by known cameras
     """
-    overlaps = agreements(outlines) if len(outlines) > 2 else []
+    overlaps: list[float] = []
+    with suppress(InputError):  # of cameras that see it from one side
+        overlaps = agreements(outlines) if len(outlines) > 2 else []
     groups = {
         "its border is uncertain": [name for name, view in views.items() if view.doubt > MOST_DOUBT],
         "it differs from what the other photos show": [

@@ -9,11 +9,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image, ImageOps
+from PIL import Image
 from scipy import ndimage
 
 from factorlib.errors import InputError
+from factorlib.labels.mask_files import opaque_part
 from factorlib.reading import reading
 
 WITHOUT = "make setup EXTRAS=masks, or name a model with MATTE=<file.onnx>; or use photos with an alpha channel"
@@ -28,14 +30,12 @@ MOST_DOUBT = 3.5
 Matte = Float[np.ndarray, "h w"]
 
 
-def alpha_matte(path: Path) -> Matte | None:
-    """Return the alpha channel of a photo as displayed, from 0 to 1; None if it has none, or all is opaque."""
-    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        return None
-    with reading("an image", path, "PHOTOS"), Image.open(path) as image:
-        rgba = ImageOps.exif_transpose(image).convert("RGBA")
-    alpha = np.asarray(rgba)[..., 3] / np.float32(255)
-    return None if alpha.min() == 1 else alpha
+def opaque_pixels(path: Path) -> Bool[np.ndarray, "h w"] | None:
+    """Return the opaque pixels of a photo as displayed; None if it has no alpha channel, or one that hides nothing."""
+    image = oiio.ImageBuf(str(path) if path.suffix.lower() in (".png", ".tif", ".tiff") else "")
+    channel = image.spec().alpha_channel
+    alpha = oiio.ImageBufAlgo.reorient(oiio.ImageBufAlgo.channels(image, (channel,)))
+    return None if channel < 0 else opaque_part(np.asarray(alpha.get_pixels(oiio.UINT16))[..., 0])
 
 
 def foreground(matte: Matte) -> Bool[np.ndarray, "h w"]:

@@ -76,7 +76,7 @@ def _masked_stem(path: Path, stems: set[str]) -> str | None:
     inner = folder_and_stem(stem)[1]
     named = inner in stems and inner != path.stem
     in_folder = any(part.lower().startswith("mask") for part in path.parts[:-1])
-    return inner if path.suffix.lower() == ".png" and (named or in_folder) else None
+    return inner if in_folder or (named and path.suffix.lower() == ".png") else None
 
 
 def _cameras(folder: Path, files: list[Path]) -> tuple[Cameras | None, dict[str, Any]]:

@@ -81,6 +81,7 @@ class Display:
 
     Attributes:
         stages: numbers of steps, and of those left, by stage
+        warnings: warnings of steps, which `close` prints; those of a failed step, which no result keeps, `fail` prints
     """
 
     def __init__(self) -> None:
@@ -102,6 +103,7 @@ class Display:
         self._bars = progress.Progress(
             *columns, console=Console(file=stream), disable=self.plain, speed_estimate_period=600
         )
+        self.warnings: list[tuple[Step, str]] = []
         self._rows: dict[str, Any] = {}
         self._running: dict[Step, tuple[float, str]] = {}  # share done, and description
         self._reported: set[str] = set()  # messages that are printed once
@@ -154,8 +156,11 @@ class Display:
             self.report(f"{step.stage:<10} {step.item:<16} {seconds:6.1f} s")
 
     def fail(self, step: Step, error: str, traceback: str | None) -> None:
-        """Print the error of a step, with the traceback of a defect of the program."""
+        """Print the warnings and the error of a step, with the traceback of a defect of the program."""
         self._running.pop(step, None)
+        for text in (text for each, text in self.warnings if each == step):
+            self.report(f"warning: {step}: {text}")
+        self.warnings = [warning for warning in self.warnings if warning[0] != step]
         self.report(f"error: {step}: {error}")
         if traceback:
             self.report(f"  this is a defect of the program, not of your input:\n{traceback}")
@@ -171,5 +176,7 @@ class Display:
         )
 
     def close(self) -> None:
-        """Remove the bars and release the terminal."""
+        """Remove the bars, release the terminal, and print the warnings."""
         self._bars.stop()
+        for line in warning_lines(self.warnings):
+            self.report(line)

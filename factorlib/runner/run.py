@@ -70,7 +70,6 @@ class Run:
         completed: steps that succeeded
         failed: steps that failed, with their outcomes
         held_up: steps that need the result of a failed one
-        warnings: of all steps, in the order of their beginning
     """
 
     def __init__(self, state: DatasetState, display: Display, folder: Path, workers: Workers):
@@ -84,7 +83,6 @@ class Run:
         self.completed: set[Step] = set()
         self.failed: dict[Step, Outcome] = {}
         self.held_up: list[Step] = []
-        self.warnings: list[tuple[Step, str]] = []
         self.planned: dict[Step, PlannedStep] = {}
         self.stale = True  # There are results that the plan does not know.
 
@@ -194,7 +192,7 @@ class Run:
             with contextlib.suppress(ValueError):  # cut where the step's process was killed
                 event = json.loads(line)
                 if "warning" in event:
-                    self.warnings.append((work.step, event["warning"]))
+                    self.display.warnings.append((work.step, event["warning"]))
                 else:
                     self.display.progress(work.step, event["done"], event["total"], event["text"])
 

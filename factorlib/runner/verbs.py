@@ -87,7 +87,7 @@ def _print_results(state: DatasetState, whole: bool) -> str:
 
 
 def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
-    from factorlib.runner.display import Display, warning_lines
+    from factorlib.runner.display import Display
     from factorlib.runner.run import run
 
     started = time.perf_counter()
@@ -102,7 +102,6 @@ def _run(state: DatasetState, planned: list[PlannedStep]) -> int:
     finally:
         display.close()
     name = state.data.folder.name
-    print(*(f"{line}\n" for line in warning_lines(result.warnings)), sep="", end="", file=sys.stderr)
     if failed := list(result.failed):
         print(f"{name}: {count(failed)} failed: {summarize(failed, MOST_FAILED, ', ')}")
         if result.held_up:

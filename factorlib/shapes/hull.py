@@ -215,6 +215,9 @@ def focal_by_hull(
         outlines: Outlines by focal length, pixels.
         longest: Longer side of the photos, pixels.
         report: Called with the completed share, from 0 to 1.
+
+    Raises:
+        InputError: If there is no hull at any of them.
     """
     steps = count()
 
@@ -224,7 +227,11 @@ def focal_by_hull(
         return -hull_overlap(outlines(float(np.exp(log))))
 
     bounds = np.log(longest * np.array(FOCALS))
-    return float(np.exp(minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": TRIALS}).x))
+    best = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": TRIALS})
+    if best.fun == 0:
+        cure = "write it as `fl_x`, with `w` and `h`"
+        raise InputError("there is no focal length, and no hull that tells it: no body fits the masks", cure=cure)
+    return float(np.exp(best.x))
 
 
 def _sample(

@@ -112,6 +112,7 @@ def test_exr_channels_go_by_name_and_without_colours_it_is_refused(tmp_path):
 
 
 AP1 = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)  # ACES: red, green, blue, white
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])  # of sRGB, IEC 61966-2-1
 
@@ -126,13 +127,15 @@ def test_colours_of_other_primaries_are_rec709_and_those_of_rec709_the_same_bits
 
     plain = read_photo(save(tmp_path / f"b.{suffix}", RADIANCE)).radiance
     assert np.array_equal(read(REC709, RADIANCE), plain)
-    red, white = (XYZ @ read(AP1, np.full((2, 8, 3), colour, np.float32))[0, 0] for colour in ((0.5, 0, 0), (1, 1, 1)))
+    whites = [XYZ @ read(space, np.ones((2, 8, 3), np.float32))[0, 0] for space in (AP1, AP0)]
+    red = XYZ @ read(AP1, np.full((2, 8, 3), (0.5, 0, 0), np.float32))[0, 0]
     assert red / red.sum() == pytest.approx([0.713, 0.293, -0.006], abs=1e-3) and red[1] == pytest.approx(
         0.5 * 0.2722, abs=1e-3
     )
-    assert white / white.sum() == pytest.approx([0.32168, 0.33767, 0.34065], abs=1e-3)
+    for white in whites:
+        assert white / white.sum() == pytest.approx([0.32168, 0.33767, 0.34065], abs=1e-3)
     assert np.array_equal(read((0,) * 8, RADIANCE), plain)  # as OpenImageIO writes what it does not know
-    refusal("chromaticities", read, (0.7, -0.3, *REC709[2:]), RADIANCE)
+    refusal("chromaticities", read, (0.3, 0.4) * 4, RADIANCE)
 
 
 @pytest.mark.parametrize("left, top", [(2, 1), (-3, -2), (20, 1), (2, 13)])

@@ -10,7 +10,7 @@ from pycocotools import mask as pycocomask
 
 from factorlib.labels.grow import grow
 from factorlib.labels.label_image import Labels, check_materials, read_labels, read_object_indices
-from factorlib.labels.mask_files import read_values, run_lengths
+from factorlib.labels.mask_files import read_labels_in, read_values, run_lengths
 from tests.refusal import refusal
 
 MATERIALS = ["red", "white", "wood"]
@@ -86,7 +86,7 @@ def labelme(folder, shapes, size=(H, W)):
 def cvat(folder, mode):
     (folder / "m/SegmentationClass").mkdir(parents=True)
     (folder / "m/labelmap.txt").write_text(
-        "# label:color_rgb:parts:actions\nbackground:0,0,0::\nred:250,250,0::\nwood:0,0,77::\n"
+        "# label:color_rgb:parts:actions\nbackground:0,0,0::\n\nred:250,250,0::\nwood:0,0,77::\n"
     )
     colours = np.array([[0, 0, 0], [250, 250, 0], [9, 9, 9], [0, 0, 77]], np.uint8)
     Image.fromarray(colours[LABEL]).convert(mode, palette=Image.Palette.ADAPTIVE).save(
@@ -101,6 +101,11 @@ def cut_out(inside):
     )
 
 
+def quantized(path, inside):
+    Image.fromarray(cut_out(inside)).quantize(200).save(path)
+    return path.name
+
+
 RED, WOOD = LABEL == 1, LABEL == 3
 FORMS = {
     "grey": lambda at: save(at / "a.png", LABEL),
@@ -113,6 +118,8 @@ FORMS = {
     "one each, 16 bit": lambda at: {"red": save(at / "r.png", RED * np.uint16(65535)), "wood": save(at / "w.png", WOOD * np.uint16(50000))},
     "one each, 1 bit": lambda at: {"red": save(at / "r.png", RED), "wood": save(at / "w.png", WOOD)},
     "transparent": lambda at: {"red": save(at / "r.png", cut_out(RED)), "wood": save(at / "w.png", cut_out(WOOD))},
+    "transparent palette": lambda at: {"red": quantized(at / "r.png", RED), "wood": quantized(at / "w.png", WOOD)},
+    "opaque everywhere": lambda at: {"red": save(at / "r.png", np.dstack([RED * np.uint8(255)] * 3 + [np.full_like(LABEL, 254)])), "wood": save(at / "w.png", WOOD)},
     "colours": lambda at: cvat(at, "RGB"),
     "colours of a palette": lambda at: cvat(at, "P"),
     "labelme": lambda at: labelme(at, [("red", [[3, 2], [12, 9]], "rectangle"), ("wood", [[5, 10], [25, 10], [25, 18], [5, 18]], "polygon")]),
@@ -147,6 +154,14 @@ def test_grey_of_few_bits_is_not_stretched_255_is_left_out_or_inside_and_a_soft_
     assert (result.label[5] == 0).all() and (result.label[6:8] == 2).all() and not result.left_out.any()
 
 
+def test_forty_labels_are_labels_and_a_soft_matte_has_none(tmp_path):
+    many = np.arange(H * W, dtype=np.uint16).reshape(H, W) // 15
+    for values in (many, many.astype(np.uint8)):
+        assert read_labels_in(tmp_path / save(tmp_path / "a.png", values), KEY) == set(range(1, 40))
+    for matte in (np.linspace(0, 255, H * W).reshape(H, W).astype(np.uint8), many * 1600):
+        assert read_labels_in(tmp_path / save(tmp_path / "a.png", matte), KEY) == set()
+
+
 def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -168,6 +183,8 @@ def test_masks_that_are_empty_or_overlap(tmp_path):
 def test_an_outline_within_another_is_in_front_of_it_and_shapes_without_an_outline_are_refused(tmp_path, caplog):
     result = labels(tmp_path, coco(tmp_path, [(10, [box(12, 12, 15, 15)]), (12, [box(5, 10, 25, 18)])]))
     assert (result.label == 1).sum() == 9 and (result.label == 3).sum() == 151 and "'red' is in front" in caplog.text
+    same = coco(tmp_path, [(10, [box(12, 12, 15, 15)]), (12, [box(12, 12, 15, 15)])])
+    assert "share 9 pixels" in refused(tmp_path, same)
     assert "draw its outline" in refused(tmp_path, labelme(tmp_path, [("red", [[1, 1], [9, 9]], "line")]))
 
 

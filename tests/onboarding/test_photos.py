@@ -2,20 +2,25 @@
 
 import importlib.util
 import json
+import shutil
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
 from factorlib.dataset.read_dataset import read_dataset
+from factorlib.dataset.sources.source_image import SourceImage
 from factorlib.generate.solids import SHAPES
 from factorlib.geometry.raster import rasterise
-from factorlib.onboarding.from_photos import dataset_from_photos
-from factorlib.onboarding.matte import MatteModel, doubt, foreground
+from factorlib.onboarding.from_photos import dataset_from_photos, distorted_camera, doubtful_masks, read_views
+from factorlib.onboarding.matte import MatteModel, doubt, foreground, opaque_pixels
 from factorlib.onboarding.photo_folder import read_photo_folder
+from factorlib.shapes.hull import focal_by_hull
 from factorlib.validation import Validation
+from tests.images.test_photo import save
 from tests.refusal import refusal
-from tests.shapes.outlines import CAMERA, looking_from
+from tests.shapes.outlines import CAMERA, looking_from, outline
 
 POSES = [looking_from(elevation, 45 * k) for k, elevation in enumerate([10, 40, -10, 30, 50, 0, 25, -25])]
 
@@ -50,7 +55,7 @@ def test_cut_outs_with_poses_become_a_valid_dataset_with_a_hull_and_a_focal_leng
     assert "mask of 5 in" in notes[-1] and "differs" in notes[-1] and steps == sorted(steps)
 
 
-@pytest.mark.parametrize("mask", ["7_mask.png", "7.jpg.png", "masks/7.png", "alpha/m.png"])
+@pytest.mark.parametrize("mask", ["7_mask.png", "7.jpg.png", "masks/7.png", "masks/7.jpg", "alpha/m.png"])
 def test_masks_are_no_photos_and_the_cameras_tell_which_images_are(tmp_path, mask):
     for name in (mask, "images/7.jpg", "images_2/7.jpg", "other/8.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -60,6 +65,38 @@ def test_masks_are_no_photos_and_the_cameras_tell_which_images_are(tmp_path, mas
     images, masks, cameras = read_photo_folder(tmp_path, sorted(p for p in tmp_path.rglob("*") if p.is_file()))
     assert images == [tmp_path / "images/7.jpg"] and masks == {"7": tmp_path / mask}
     assert cameras.source == {"transforms": "cameras/transforms.json"}
+
+
+@pytest.mark.parametrize("top, dtype", [(255, np.uint8), (65535, np.uint16)])
+def test_a_mask_beside_a_photo_is_its_labels_or_a_matte_cut_at_half(tmp_path, top, dtype):
+    Image.fromarray(np.zeros((2, 4, 3), np.uint8)).save(tmp_path / "a.jpg")
+    for values, inside in (([0, 1, 2, 255], [0, 1, 1, 0]), ([0, top // 3, top // 2 + 1, top], [0, 0, 1, 1])):
+        Image.fromarray(np.array([values] * 2, dtype)).save(tmp_path / "a_mask.png")
+        shutil.rmtree(tmp_path / "masks", ignore_errors=True)
+        read_views({"a": tmp_path / "a.jpg"}, {"a": tmp_path / "a_mask.png"}, None, tmp_path, lambda share, text: None)
+        assert np.asarray(Image.open(tmp_path / "masks" / "a.png")).tolist() == [inside] * 2
+
+
+def test_a_tiff_of_floats_has_no_alpha_and_one_that_hides_nothing_is_none(tmp_path):
+    save(tmp_path / "a.tif", np.ones((2, 4, 3), np.float32))
+    save(tmp_path / "b.tif", np.full((2, 4, 4), 65000, np.uint16), ["R", "G", "B", "A"])
+    assert opaque_pixels(tmp_path / "a.tif") is None and opaque_pixels(tmp_path / "b.tif") is None
+
+
+def test_a_lens_that_two_coefficients_describe_is_a_camera_and_a_fisheye_is_none():
+    radial, fisheye = (
+        pycolmap.Camera(model=model, width=1000, height=750, params=[400, *params])
+        for model, params in (("RADIAL", (500, 375, -0.1, 0.02)), ("OPENCV_FISHEYE", (400, 500, 375, 0.01, 0, 0, 0)))
+    )
+    camera = distorted_camera(SourceImage("a", radial, (1000, 750), "a"), 1000)["camera"]
+    assert [camera["focal_px"], *camera["distortion"]] == pytest.approx([400, -0.1, 0.02], rel=1e-3)
+    assert distorted_camera(SourceImage("a", fisheye, (1000, 750), "a"), 1000) == {}
+
+
+def test_cameras_at_one_place_tell_no_focal_length_and_no_doubt():
+    same = [outline(SHAPES["blob"](), POSES[0], True)] * 3
+    assert doubtful_masks({}, same) == []
+    refusal("no focal length", focal_by_hull, lambda focal: same, 300)
 
 
 def test_without_the_network_the_error_has_the_command(monkeypatch):

@@ -221,6 +221,15 @@ def test_a_run_ends_with_at_most_five_lines_of_warnings_each_of_one_fault():
     assert lines[-1].startswith("3 more warnings: `make status`")
 
 
+def test_warnings_are_printed_at_the_end_of_any_run_and_before_the_error_of_their_step(capsys):
+    shown, steps = display.Display(), [Step("upper", "a"), Step("upper", "b")]
+    shown.warnings += [(step, f"{step.item} is odd") for step in steps]
+    shown.fail(steps[1], "bad", None)
+    shown.close()
+    expected = ["warning: upper/b: b is odd", "error: upper/b: bad", "warning: upper/a: a is odd"]
+    assert capsys.readouterr().err.splitlines() == expected
+
+
 def test_a_terminal_shows_a_bar_for_each_stage_and_lines_above_them(monkeypatch):
     terminal, steps = io.StringIO(), [Step("upper", "a"), Step("upper", "b")]
     terminal.isatty = lambda: True

@@ -5,7 +5,7 @@ precedence: an object with a pose or keypoints there gets no pose from the sourc
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -47,7 +47,8 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
     external = {}
     photos = []
     kind = next(kind for kind in SOURCES if getattr(source, kind) is not None)
-    images = match_images(spec, kind, READERS[kind](getattr(source, kind), refuse), refuse)
+    paths = {photo.name: photo.image for photo in spec.photos}
+    images = match_images(paths, source.images, kind, READERS[kind](getattr(source, kind), refuse), refuse)
     for photo in spec.photos:
         image = images.get(photo.name)
         if image is None:
@@ -78,21 +79,20 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
     return msgspec.structs.replace(spec, photos=photos), external
 
 
-def match_images(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Refusal) -> dict[str, SourceImage]:
-    """Match the photos to images of the source.
+def match_images(
+    paths: Mapping[str, str], chosen: Mapping[str, str | int], kind: str, images: list[SourceImage], refuse: Refusal
+) -> dict[str, SourceImage]:
+    """Return the image of the source for each photo that has one.
 
-    The match is by `images`, else by path, by file name, or by file name without suffix; for BOP it is by id.
+    The match is by choice, else by path, by file name, or by file name without suffix; for BOP it is by id.
 
     Args:
-        spec: content of dataset.yaml
+        paths: path of each photo
+        chosen: names of images by photo, the key `cameras.images`
         kind: kind of the source
         images: images of the source
         refuse: raises errors
-
-    Returns:
-        The matching image by photo.
     """
-    assert spec.cameras is not None
     by_name = {image.name: image for image in images}
     by_pattern: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
     for image in images:
@@ -101,23 +101,22 @@ def match_images(spec: DatasetFile, kind: str, images: list[SourceImage], refuse
         for pattern in (("id", image.name), ("path", *path.parts), ("file", path.name), ("stem", stem)):
             by_pattern.setdefault(pattern, []).append(image)
     result = {}
-    for photo in spec.photos:
-        key = f"cameras.images.{photo.name}"
-        if photo.name in spec.cameras.images:
-            name = spec.cameras.images[photo.name]
-            refuse.refuse_if(
-                name not in by_name, key, f"the source has no image {name!r}", did_you_mean(str(name), by_name)
-            )
-            result[photo.name] = by_name[name]
+    for photo, place in paths.items():
+        key = f"cameras.images.{photo}"
+        if photo in chosen:
+            name = chosen[photo]
+            cure = did_you_mean(str(name), by_name)
+            refuse.refuse_if(name not in by_name, key, f"the source has no image {name!r}", cure)
+            result[photo] = by_name[name]
             continue
-        matches = ([image for pattern in each for image in by_pattern.get(pattern, [])] for each in _patterns(photo))
+        matches = ([image for pattern in each for image in by_pattern.get(pattern, [])] for each in _patterns(place))
         candidates = next(filter(None, matches), [])
         if len(candidates) > 1:
             names = ", ".join(repr(image.name) for image in candidates[:3])
-            fault = f"{photo.image!r} matches several images of the source: {names}"
-            refuse(key, fault, f"choose one: cameras.images: {{{photo.name}: …}}")
+            fault = f"{place!r} matches several images of the source: {names}"
+            refuse(key, fault, f"choose one: cameras.images: {{{photo}: …}}")
         if candidates:
-            result[photo.name] = candidates[0]
+            result[photo] = candidates[0]
     if not result:
         examples = ", ".join(repr(image.name) for image in images[:3]) or "none at all"
         cure = "assign images to photos: cameras.images: {photo: image, …}"
@@ -125,9 +124,9 @@ def match_images(spec: DatasetFile, kind: str, images: list[SourceImage], refuse
     return result
 
 
-def _patterns(photo: PhotoEntry) -> list[list[tuple]]:
+def _patterns(photo: str) -> list[list[tuple]]:
     """Return the names under which a photo may stand in a source, the strictest first."""
-    path = PurePosixPath(photo.image)
+    path = PurePosixPath(photo)
     number = int(path.stem) if path.stem.isascii() and path.stem.isdigit() else None
     tails: list[tuple] = [("path", *path.parts[-length:]) for length in range(1, len(path.parts) + 1)]
     return [[("id", number)], tails, [("file", path.name)], [("stem", path.stem)]]
