@@ -320,8 +320,6 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             sharing = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
             if without := [photo.name for photo in sharing if photo.name not in spec.known.exposure]:
                 refuse(key, f"photo {without[0]!r}, of the same light, has none", "give all of them an EV, or none")
-            if len(sharing) == 1:
-                refuse(key, "no other photo shares its light, so its exposure would have no effect", "leave it out")
     for name, light in spec.known.illumination.items():
         with refuse.collect_fault():
             key = f"known.illumination.{name}"

@@ -233,7 +233,6 @@ BAD = [
     ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "vase_1"}}}, "white' too"),
     ("known > .illumination.hall.chrome", {"illumination": {"hall": {"chrome": "box_1"}}}, "specular reflectance of"),
     ("known > .exposure.hal", {"exposure": {"hal": 1}}, "did you mean 'hall'"),
-    ("known > .exposure.hall", {"exposure": {"hall": 1}}, "no other photo shares its light"),
     ("known > .materials.red.roughness", {"materials": {"red": {"diffuse": [0.5] * 3, "roughness": 0.0}}}, "0.1 to 1"),
 ]
 
