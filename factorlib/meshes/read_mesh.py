@@ -119,13 +119,18 @@ class MeshCache:
         return self._meshes[key]
 
     def _textured(self, mesh: Mesh, name: str, file: Path) -> Mesh:
-        """Return the mesh `name` of a file, subdivided, with its textures as detail; itself if it has none."""
+        """Return the mesh `name` of a file, subdivided, with its textures as detail; itself if it has none.
+
+        All choices of materials have the same faces, also those without a textured material.
+        """
         longest, factors = self.textures.get(name, (0.0, {}))
-        labels = [label for label in mesh.labels if self.materials[label - 1] in factors]
-        if not labels:
+        if not factors:
             return mesh
         fine = subdivided_mesh(mesh, longest)
         _check_nodes(factors.values(), fine, file, "texture")
+        labels = [label for label in mesh.labels if self.materials[label - 1] in factors]
+        if not labels:
+            return fine.mesh
         detail = np.ones((len(fine.mesh.vertices), 3))
         for label in labels:
             vertices = np.unique(fine.mesh.faces[fine.mesh.face_label == label])
