@@ -105,8 +105,8 @@ class PhotoScores(msgspec.Struct, frozen=True):
         gains = reference.values - self.values
         return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
-    def decide_against(self, reference: PhotoScores) -> Decision:
-        """Return the decision on the turns of these scores: kept if the log Bayes factor exceeds `VERY_STRONG`."""
+    def evidence_over(self, reference: PhotoScores) -> Decision:
+        """Return the decision on turns: kept if their log Bayes factor exceeds `VERY_STRONG`."""
         factor = float((reference.values - self.values).sum()) / 2
         evidence = compare_models(reference.losses, self.losses, 0.0)
         return msgspec.structs.replace(evidence, accepted=factor > VERY_STRONG, log_bayes_factor=factor)
@@ -296,7 +296,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
             scores = self.trial.score_photos(turns, self.tick, self.plain)
             if best is not None and round(float(scores.values.sum() - best.scores.values.sum()), 3) >= 0:
                 break
-            best = StiffnessChoice(stiffness, turns, scores, scores.decide_against(self.plain))
+            best = StiffnessChoice(stiffness, turns, scores, scores.evidence_over(self.plain))
             if scores.gain_over(self.plain) < CLEARLY_AGAINST:
                 break
         assert best is not None
@@ -309,7 +309,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
         if 0 < len(movable) < len(self.trial.surfaces.meshes):
             restricted = [self.trial.restrict_turns(turn, movable) for turn in best.turns]
             scores = self.trial.score_photos(restricted, self.tick, self.plain)
-            best = best._replace(scores=scores, evidence=scores.decide_against(self.plain))
+            best = best._replace(scores=scores, evidence=scores.evidence_over(self.plain))
         return best, movable
 
     def fit_all_photos(self, stiffness: float, movable: set[str], pieces: ProgressSections, seed: int) -> Turns:
@@ -343,7 +343,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
             return set(names)
         restricted = [(name, [self.trial.restrict_turns(turn, {name}) for turn in turns]) for name in names]
         scores = {name: self.trial.score_photos(turns, self.tick, self.plain) for name, turns in restricted}
-        return {name for name, mesh_scores in scores.items() if mesh_scores.decide_against(self.plain).accepted}
+        return {name for name, mesh_scores in scores.items() if mesh_scores.evidence_over(self.plain).accepted}
 
 
 def estimate_surface(

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence, Sized
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -248,12 +248,23 @@ def _draw_sheet(project: Project, folder: Path) -> None:
     print(f"  contact sheet: {project.short_path(path)}")
 
 
+class MatteFile(NamedTuple):
+    """ONNX file of a matting network; None for that of the extra `masks`."""
+
+    path: Path | None
+
+
 def begin(
-    project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None, auto: bool = False
+    project: Project, dataset: str, photos: Path | None, meshes: Path | None, masks: Path | MatteFile | None
 ) -> int:
     """Create a dataset from folders of files, and print what is left to do.
 
-    auto: estimate masks and cameras; `masks` then is the ONNX file of another matting network, or None
+    Args:
+        project: the project
+        dataset: name of the dataset, or its path
+        photos: folder of photos
+        meshes: folder of meshes, or None
+        masks: folder of masks, or None; a `MatteFile`: masks and cameras are estimated
     """
     if photos is None:
         cure = "add PHOTOS=<folder>, and for `make new` MASKS=<folder> and MESHES=<folder> if you have these"
@@ -261,10 +272,10 @@ def begin(
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     notes = []
-    if auto:
+    if isinstance(masks, MatteFile):
         with _shown("photos") as progress:  # modules by name: they are science
             create = import_module("factorlib.onboarding.from_photos").dataset_from_photos
-            missing, notes = create(folder, photos, meshes, masks, lambda share, text: progress(share, 1, text))
+            missing, notes = create(folder, photos, meshes, masks.path, lambda share, text: progress(share, 1, text))
     else:
         missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
     ending = "; still missing, or yours to decide:" if missing else ""
@@ -275,7 +286,7 @@ def begin(
         _draw_sheet(project, folder)
     except InputError as fault:
         print(f"  no contact sheet: {fault}")
-    if auto and not missing:
+    if isinstance(masks, MatteFile) and not missing:
         return validate(project, dataset, [])
     drawn = f"name your materials in it, then {project.command('label', dataset)}, then "
     first = drawn if any("make label" in line for line in missing) else ""
