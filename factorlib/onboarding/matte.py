@@ -32,10 +32,14 @@ Matte = Float[np.ndarray, "h w"]
 
 def opaque_pixels(path: Path) -> Bool[np.ndarray, "h w"] | None:
     """Return the opaque pixels of a photo as displayed; None if it has no alpha channel, or one that hides nothing."""
-    image = oiio.ImageBuf(str(path) if path.suffix.lower() in (".png", ".tif", ".tiff") else "")
+    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+        return None
+    image = oiio.ImageBuf(str(path))
     channel = image.spec().alpha_channel
+    if channel < 0:
+        return None
     alpha = oiio.ImageBufAlgo.reorient(oiio.ImageBufAlgo.channels(image, (channel,)))
-    return None if channel < 0 else opaque_part(np.asarray(alpha.get_pixels(oiio.UINT16))[..., 0])
+    return opaque_part(np.asarray(alpha.get_pixels(oiio.UINT16))[..., 0])
 
 
 def foreground(matte: Matte) -> Bool[np.ndarray, "h w"]:

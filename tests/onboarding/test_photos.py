@@ -16,6 +16,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.onboarding.from_photos import dataset_from_photos, distorted_camera, doubtful_masks, read_views
 from factorlib.onboarding.matte import MatteModel, doubt, foreground, opaque_pixels
 from factorlib.onboarding.photo_folder import read_photo_folder
+from factorlib.scenes.stage_runs import CHECKOUT
 from factorlib.shapes.hull import focal_by_hull
 from factorlib.validation import Validation
 from tests.images.test_photo import save
@@ -97,6 +98,11 @@ def test_cameras_at_one_place_tell_no_focal_length_and_no_doubt():
     same = [outline(SHAPES["blob"](), POSES[0], True)] * 3
     assert doubtful_masks({}, same) == []
     refusal("no focal length", focal_by_hull, lambda focal: same, 300)
+
+
+def test_a_photo_without_alpha_prints_nothing(capfd):
+    assert opaque_pixels(CHECKOUT / "data/eames/photos/hall.jpg") is None
+    assert capfd.readouterr() == ("", "")
 
 
 def test_without_the_network_the_error_has_the_command(monkeypatch):
