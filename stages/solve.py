@@ -27,7 +27,12 @@ from factorlib.inference.held_out_photos import fit_held_out_lights, predicted_e
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.known import extract_known
-from factorlib.inference.observed import blocks_of_observations, gather_observations, usable_observations
+from factorlib.inference.observed import (
+    blocks_of_observations,
+    gather_observations,
+    read_backgrounds,
+    usable_observations,
+)
 from factorlib.inference.paper_solver import REPORTS, PaperOptions, Prior, Samplings
 from factorlib.inference.paper_solver import solve_paper as solve_as_the_paper
 from factorlib.inference.problem import JointProblem
@@ -193,7 +198,12 @@ def _build_problem(
     observations, known = extract_known(declared, maps, balls, urm.at_one_exposure(observations, relative), lights)
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     blocks = blocks_of_observations(
-        observations, Noise(), held_out=params.held_out, world_from_camera=rotations, seed=params.seed
+        observations,
+        Noise(),
+        held_out=params.held_out,
+        world_from_camera=rotations,
+        seed=params.seed,
+        backgrounds=read_backgrounds(inputs["urm"], relative),
     )
     automatic: Name = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator

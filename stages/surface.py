@@ -17,7 +17,7 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice, solved_photos
 from factorlib.images.exr import write_exr
 from factorlib.inference.aligned_photo import read_aligned_photos, visible_meshes
 from factorlib.inference.blocks import Noise
-from factorlib.inference.observed import blocks_of_observations, usable_observations
+from factorlib.inference.observed import blocks_of_observations, read_backgrounds, usable_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
 from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
@@ -116,8 +116,11 @@ def _estimate_surface(
         name: np.array(light.world_from_camera) for name, light in lights.items() if light.world_from_camera is not None
     }
     merged = concatenate(list(observations.values()))
-    merged = at_one_exposure(merged, relative_exposures(merged))
-    blocks = blocks_of_observations(merged, Noise(), world_from_camera=worlds, seed=params.seed)
+    relative = relative_exposures(merged)
+    backgrounds = read_backgrounds(inputs["urm"], relative)
+    blocks = blocks_of_observations(
+        at_one_exposure(merged, relative), Noise(), world_from_camera=worlds, seed=params.seed, backgrounds=backgrounds
+    )
     in_frame = [light.rotate(worlds.get(name, np.eye(3))) for name, light in attached.items()]
     problem = JointProblem(blocks, reflection_operator("network", weights=inputs["train"]), spread=inputs.map)
     nodes = concatenate_positions(in_frame)

@@ -1,7 +1,8 @@
 """Unstructured reflectance map (URM): observations of one photo, from pixels with a known material and normal.
 
 Observations also have `visibility`, the share of light that arrives from each direction past the photo's meshes, and
-`met`, the surfaces that hide the rest.  Writes <photo>.parquet.
+`met`, the surfaces that hide the rest.  Writes <photo>.parquet, and background/<photo>.exr: the radiance of the
+surroundings where the photo shows them, by direction from the objects.
 """
 
 import logging
@@ -12,15 +13,17 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.dataset.schema import ObjectsSlice
+from factorlib.dataset.schema import GroundSlice, ObjectsSlice
+from factorlib.geometry.ground import Plane, resting_plane
 from factorlib.geometry.occlusion import Occluders
-from factorlib.images.exr import read_exr
-from factorlib.meshes.mesh import scale_mesh
+from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
+from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import PhotoSource, extract_observations
+from factorlib.urm.background import surrounding_radiance
+from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre
 from factorlib.urm.observations import write_observations
 from factorlib.urm.reduction import merge, sample
 
@@ -55,12 +58,19 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)
     observations = sample(observations, params.most)
+    poses = read_photo_poses(inputs["align"] / f"{name}.json")
+    height, width = photo["label"].shape
+    camera = poses.camera.camera(width, height)
+    meshes = read_meshes(inputs, poses.objects)
+    ground = ground_plane(inputs, meshes, poses.objects)
+    background = surrounding_radiance(photo, camera, surface_centre(geometry), ground)
+    (out / "background").mkdir()
+    write_rgb_exr(out / "background" / f"{name}.exr", background, LAT_LONG)
     # visibility: rays from observations past all meshes of the photo
     if params.directions and len(observations):
-        poses = read_photo_poses(inputs["align"] / f"{name}.json")
-        height, width = photo["label"].shape
-        visibility = read_occluders(inputs, poses.objects).visibility_at(
-            poses.camera.camera(width, height),
+        occluders = Occluders(list(meshes.values()), [poses.objects[each].pose for each in meshes])
+        visibility = occluders.visibility_at(
+            camera,
             np.column_stack([observations.x, observations.y]),
             observations.normal,
             params.directions,
@@ -72,11 +82,27 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_observations(out / f"{name}.parquet", merge(observations, params.merge_degrees))
 
 
-def read_occluders(inputs: Inputs, poses: dict[str, ObjectPose]) -> Occluders:
-    """Read the meshes of the photo's objects, at the poses that `align` estimated."""
+def read_meshes(inputs: Inputs, poses: dict[str, ObjectPose]) -> dict[str, Mesh]:
+    """Read the meshes of the photo's objects, by object, scaled as `align` estimated."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
-    entries = [poses[obj.name] for obj in slice_.objects]
-    meshes = [read.mesh(obj.mesh, slice_.meshes[obj.mesh], obj.materials) for obj in slice_.objects]
-    scaled_meshes = [scale_mesh(mesh, entry.scale) for mesh, entry in zip(meshes, entries)]
-    return Occluders(scaled_meshes, [entry.pose for entry in entries])
+    meshes = {obj.name: read.mesh(obj.mesh, slice_.meshes[obj.mesh], obj.materials) for obj in slice_.objects}
+    return {name: scale_mesh(mesh, poses[name].scale) for name, mesh in meshes.items()}
+
+
+def ground_plane(inputs: Inputs, meshes: dict[str, Mesh], poses: dict[str, ObjectPose]) -> Plane | None:
+    """Return the ground of dataset.yaml, or else the lowest plane on which an object rests; None without one.
+
+    The plane is in the camera's frame.
+    """
+    given = msgspec.convert(inputs.facts["dataset.ground"], GroundSlice).ground
+    if given is not None:
+        normal = np.array(given.normal)
+        return Plane(normal / np.linalg.norm(normal), np.array(given.point))
+    planes = []
+    for name, mesh in meshes.items():
+        pose = poses[name].pose
+        upright = pose.rotation.T @ [0.0, -1.0, 0.0]
+        planes.append(resting_plane(mesh.vertices, pose.apply(mesh.vertices), pose.rotation, upright[None]))
+    resting = [plane for plane in planes if plane is not None]
+    return min(resting, key=lambda plane: plane.point @ resting[0].normal, default=None)

@@ -75,7 +75,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
                 solved[name] = msgspec.structs.replace(solved[name], prior_share=table.PriorShares(*parts))
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
-        absolute = self.solution.interreflection.accepted
+        absolute = self._is_absolute
         gauge = table.Gauge(RULE + DETERMINED * absolute + self._known_rule(), component, self._gauge_of_errors())
         return table.MaterialTable(solved, gauge, self.model())
 
@@ -108,11 +108,16 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         parts = zip(("diffuse", "specular", "roughness"), (0, 3, 6), strict=True)
         return UNSET if values is None else [part for part, column in parts if not np.isnan(values[column])]
 
+    @property
+    def _is_absolute(self) -> bool:
+        """True if interreflection or a background fixes a scale."""
+        return self.solution.interreflection.accepted or any(each.accepted for each in self.solution.backgrounds)
+
     def _gauge_of_errors(self) -> str:
         """Return the sentence that states the gauge of the standard errors."""
         return (
             GAUGE
-            + ABSOLUTE * self.solution.interreflection.accepted
+            + ABSOLUTE * self._is_absolute
             + uncertainty.GIVEN * bool(self.problem.known.materials or self.problem.known.lights)
         )
 
@@ -166,6 +171,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
             light_prior=self.solver == "joint",
             splitting_chosen_by=solution.splitting,
             suns_chosen_by=dict(zip(lights, solution.suns)),
+            background_chosen_by=dict(zip(lights, solution.backgrounds)),
             tone={
                 photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
                 for block, light in illuminations

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from factorlib.geometry.sphere import mirror_cells
+from factorlib.inference.background import Background
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
@@ -94,6 +95,7 @@ class Block(msgspec.Struct, frozen=True):
         confidence: Confidence of the normals, 0 to 1; None if all are equally reliable.
         place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
         row: Index of the observation among all usable ones.
+        background: Surroundings that the photos show; None if they are not used.
     """
 
     name: str
@@ -114,6 +116,7 @@ class Block(msgspec.Struct, frozen=True):
     confidence: Float[np.ndarray, " n"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
     row: Int[np.ndarray, " n"] | None = None
+    background: Background | None = None
 
     def __len__(self) -> int:
         return len(self.material)

@@ -89,7 +89,7 @@ class LightTerms:
         self.groups = np.full(len(block.photos), group[block.material[0]])
         self.groups[block.photo] = group[block.material]
         # uᵀQu is a parabola in the shift of u
-        u = likelihood.log_radiance.reshape(-1)
+        u = likelihood.log_radiance.reshape(-1) - likelihood.mean
         rows = likelihood.precision.sum(0)
         self.slope = float(rows @ u)
         self.curvature = float(rows.sum())

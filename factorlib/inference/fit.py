@@ -27,6 +27,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
+from factorlib.inference.background import condition_on_background
 from factorlib.inference.blocks import FIT_LOSS, Block
 from factorlib.inference.exposures import balance_exposures
 from factorlib.inference.forward import Illumination
@@ -45,6 +46,8 @@ START_TEMPERATURE = 10.0
 # Factor on T where materials are given.  A light absorbs what wrong normals and materials do to a whole object, so that
 # residuals do not show it.  Without the factor lights have too much contrast, and their dark directions are too dark.
 LIGHT_TEMPERATURE = 4.0
+# The same where the light's background is observed too.
+BACKGROUND_TEMPERATURE = 2.0
 # Standard deviation of a sun's log radiance: in lights captured outdoors its energy is a third to twice the sky's.
 SUN_DEVIATION = 1.0
 # Least reflectance at the start.  The derivative with respect to the logarithm of a smaller one is nearly zero.
@@ -185,7 +188,8 @@ def light_likelihood(
     table = (tables or ResponseCache()).get(*arguments, roughness)
     tabulated = msgspec.structs.replace(illumination, table=table)
     return with_hyperparameters(
-        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, FIT_LOSS), hyperparameters
+        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, FIT_LOSS),
+        hyperparameters,
     )
 
 
@@ -202,7 +206,16 @@ def with_hyperparameters(likelihood: LightLikelihood, hyperparameters: Hyperpara
     if light.fixed.any():  # Q of the free cells given the held ones is their block of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
-    counts = {"precision": Q, "log_determinant": log_determinant, "temperature": hyperparameters.temperature}
+    mean = np.zeros(len(Q))
+    background = likelihood.illumination.block.background
+    if background is not None and not light.fixed.any():
+        mean, Q, log_determinant = condition_on_background(Q, background, light)
+    counts = {
+        "mean": mean,
+        "precision": Q,
+        "log_determinant": log_determinant,
+        "temperature": hyperparameters.temperature,
+    }
     return msgspec.structs.replace(likelihood, log_peaks=np.log(light.peaks), **counts)
 
 
@@ -215,7 +228,7 @@ def estimate_hyperparameters(
         likelihood: Likelihood at that point.
         system: Normal equations at that point.
         least: Least temperature.
-        factor: Factor on the temperature.
+        factor: Factor on the temperature; at most `BACKGROUND_TEMPERATURE` with a background.
     """
     light = likelihood.light
     cells, free = (np.flatnonzero(np.tile(mask, 3)) for mask in (~light.suns, light.free))
@@ -226,6 +239,8 @@ def estimate_hyperparameters(
     factors = likelihood.prior.likeliest_factors(
         light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance
     )
+    if likelihood.illumination.block.background is not None:
+        factor = min(factor, BACKGROUND_TEMPERATURE)
     residual = likelihood.illumination.residuals()
     temperature = estimate_temperature(likelihood.illumination.block, residual, least)
     return Hyperparameters(factor * temperature, factors)

@@ -54,6 +54,7 @@ PHASES = {
     "shadows": (13, 1),
     "no shadows": (8, 1),
     "shadows and bounces": (8, 1),
+    "background": (28, 1),
     "tone curves": (6, 1),
     "distances": (24, 1.5),
     "materials and lights": (11, 7),
@@ -78,6 +79,7 @@ class SolveState(msgspec.Struct, frozen=True):
         materials: Fit of the last step that fitted materials, to observations with reliable normals.
         shadows: Decision on the use of visibility.
         interreflection: Decision on light that surfaces send each other.
+        backgrounds: Decision on each light's background; empty if not tried.
         tone: Decision on each light's tone curves; empty if not tried.
         distances: Decision on each light's distance; empty if not tried.
         splitting: Decision on each splitting of the lights' cells.
@@ -90,6 +92,7 @@ class SolveState(msgspec.Struct, frozen=True):
     materials: Fit
     shadows: Decision = Decision(False)
     interreflection: Decision = Decision(False)
+    backgrounds: list[Decision] = []
     tone: list[Decision] = []
     distances: list[Decision] = []
     splitting: list[Decision] = []
@@ -107,8 +110,9 @@ class SolveState(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, fit=fit, materials=fit, **decisions)
 
     def effective_problem(self, problem: JointProblem) -> JointProblem:
-        """Return the problem under the chosen effects: with or without shadows and interreflection."""
-        return problem.with_effects(self.shadows.accepted, self.interreflection.accepted)
+        """Return the problem under the chosen effects: with or without shadows, interreflection and backgrounds."""
+        accepted = [decision.accepted for decision in self.backgrounds] or [False] * len(problem.blocks)
+        return problem.with_effects(self.shadows.accepted, self.interreflection.accepted).with_backgrounds(accepted)
 
 
 class Solution(SolveState, frozen=True, kw_only=True):

@@ -1,8 +1,9 @@
 """Gauge of a solution: connected components of materials and lights, and the rule that fixes their free factors.
 
 The data leave one factor per channel and connected component free between reflectances and lights.  No factor is free
-where surfaces light each other, because their radiance is known, nor where a reflectance or a light is known
-(`factorlib.inference.known`).  Such a component stays as it is.  A light that is known up to one factor fixes the tint.
+where surfaces light each other or photos show the surroundings, because these radiances are known, nor where a
+reflectance or a light is known (`factorlib.inference.known`).  Such a component stays as it is.  A light that is known
+up to one factor fixes the tint.
 
 Tint   Lights are as near to grey as possible, as the paper's prior asks.  Let E_ic be the summed lobe energies of light
        i.  The factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean
@@ -36,7 +37,8 @@ RULE = (
     f"the largest diffuse + specular reflectance is {BRIGHTEST}"
 )
 DETERMINED = (
-    "; components in which interreflection was seen have no free factor, and reflectances as it determines them"
+    "; components in which interreflection or surroundings were seen have no free factor, and reflectances as these "
+    "determine them"
 )
 GIVEN = "; in components with known materials or lights, scale and white balance come from these: {}"
 UP_TO_SCALE = "; where lights are known up to a factor, white balance comes from them: {}"
@@ -105,5 +107,5 @@ def fix_gauge(point: Point, blocks: Sequence[Block], known: KnownValues = KnownV
 
 
 def has_free_factor(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
-    """Return True if no block of these illuminations has interreflection, so that their component has a free factor."""
-    return all(block.bounced is None for block in blocks if block.name in illuminations)
+    """Return True if no block of these illuminations has interreflection or a background that fixes their factor."""
+    return all(block.bounced is None and block.background is None for block in blocks if block.name in illuminations)

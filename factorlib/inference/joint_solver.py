@@ -2,6 +2,8 @@
 
 effects     Held-out observations choose shadows, and marginal likelihoods interreflection
             (`factorlib.inference.model_selection`).
+background  Marginal likelihoods choose the lights that are also observed by the surroundings that photos show
+            (`factorlib.inference.background`).
 tone        Held-out observations choose tone curves.
 distances   Marginal likelihoods choose distances of lights.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
@@ -26,6 +28,7 @@ from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     TRIAL_CELLS,
+    select_backgrounds,
     select_distances,
     select_effects,
     select_tone_curves,
@@ -100,6 +103,15 @@ def choose_effects(request: SolveRequest, state: SolveState) -> SolveState:
     return select_effects(problem, request.starts, request.options, request.run.fit)
 
 
+def choose_backgrounds(request: SolveRequest, state: SolveState) -> SolveState:
+    """Choose by marginal likelihood the lights that are also observed by the surroundings that photos show."""
+    problem = reliable_observations(request.problem).with_effects(
+        state.shadows.accepted, state.interreflection.accepted
+    )
+    selection = select_backgrounds(problem, state.fit, request.options, request.run.fit)
+    return state.with_fit(selection.fit, backgrounds=selection.evidence)
+
+
 def choose_tone(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose by held-out observations which lights get tone curves, and fit them."""
     selection = select_tone_curves(request.reliable_problem(state), state.fit, request.options, request.run.fit)
@@ -148,6 +160,7 @@ def choose_suns(request: SolveRequest, state: SolveState) -> SolveState:
 
 STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
     "effects": choose_effects,
+    "background": choose_backgrounds,
     "tone": choose_tone,
     "distances": choose_distances,
     "materials": fit_materials,

@@ -1,10 +1,12 @@
 """Marginal likelihood of the materials with the lights integrated out, and its normal equations, for one illumination.
 
-A light is u, log radiance on cells, with a Gaussian prior of mean 0 and precision Q (`factorlib.light.prior`).  The
-forward model gives residuals r in σ of the noise model.  Neighbouring residuals are correlated, so a squared residual
-counts as 1/T of one (`factorlib.inference.fit`).  Minus twice the log posterior of a light is
+A light is u, log radiance on cells, with a Gaussian prior of mean m and precision Q.  It states the statistics of
+natural light, of mean 0 (`factorlib.light.prior`), or these given the surroundings that photos show
+(`factorlib.inference.background`).  The forward model gives residuals r in σ of the noise model.  Neighbouring
+residuals are correlated, so a squared residual counts as 1/T of one (`factorlib.inference.fit`).  Minus twice the log
+posterior of a light is
 
-    φ(u; θ) = Σ ρ(r)/T + uᵀ Q u.
+    φ(u; θ) = Σ ρ(r)/T + (u − m)ᵀ Q (u − m).
 
 Laplace's approximation about the minimising u integrates the light out.  Minus twice the log marginal likelihood of θ
 is then
@@ -102,7 +104,8 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         illumination: Observations and light, with its table of responses.
         prior: Prior on the light.
         log_peaks: Log of the cells' weights at radiance 1.
-        precision: Q, channel by channel, over all cells and suns.
+        mean: m, channel by channel, over all cells and suns.
+        precision: Q, likewise.
         log_determinant: log det Q of the free cells and suns.
         temperature: T, which divides squared residuals.
         loss: Robust loss ρ.
@@ -111,6 +114,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
     illumination: Illumination
     prior: LightPrior
     log_peaks: Float[np.ndarray, " p"]
+    mean: Float[np.ndarray, " 3p"]
     precision: Float[np.ndarray, "3p 3p"]
     log_determinant: float
     temperature: float
@@ -196,8 +200,8 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         return 2 * float(np.log(np.diag(factor)[:p]).sum()) - self.log_determinant
 
     def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
-        """Return uᵀQu plus the Gaussian priors of exposures and tones, and half the gradient."""
-        u = self.log_radiance.reshape(-1)
+        """Return (u − m)ᵀQ(u − m) plus the Gaussian priors of exposures and tones, and half the gradient."""
+        u = self.log_radiance.reshape(-1) - self.mean
         photo_values, width = self._photo_unknowns()
         slope = self.precision @ u
         free = np.tile(self.light.free, 3)

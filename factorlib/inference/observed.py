@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
+from factorlib.images.exr import read_rgb_exr
+from factorlib.inference.background import Background, concatenate_backgrounds
 from factorlib.inference.blocks import Block, Noise
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.problem import Spread
@@ -23,6 +25,7 @@ from factorlib.urm.observations import Observations, read_observations
 from factorlib.urm.reduction import merge
 
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
+Maps = Mapping[str, Float[np.ndarray, "h w 3"]]  # lat-long map, by the name of a photo
 
 
 HELD_OUT_CELL = 0.1  # side of the cells of mirror directions that are held out together
@@ -76,6 +79,7 @@ def blocks_of_observations(
     held_out: float = 0.1,
     world_from_camera: Rotations | None = None,
     seed: int = 0,
+    backgrounds: Maps | None = None,
 ) -> list[Block]:
     """Return one block per illumination, in order of names, without unusable observations.
 
@@ -85,6 +89,7 @@ def blocks_of_observations(
         held_out: Share of the observations that select models.
         world_from_camera: Rotation of each photo whose illumination is fixed to the world.
         seed: Seed of the random choice of held-out cells.
+        backgrounds: Maps of `read_backgrounds`.
 
     Raises:
         InputError: If no usable observation is left, or all are black.
@@ -102,7 +107,30 @@ def blocks_of_observations(
     block = partial(_block, noise=noise, share=held_out, rotations=world_from_camera or {}, seed=seed)
     rows_by_light = [np.flatnonzero(usable.illumination == i) for i in range(len(usable.illuminations))]
     blocks = [block(usable, rows) for rows in rows_by_light if len(rows)]
+    if backgrounds:
+        blocks = [_with_background(block, backgrounds, world_from_camera or {}) for block in blocks]
     return sorted(blocks, key=lambda block: block.name)
+
+
+def read_backgrounds(folder: Path, exposures: Mapping[str, float]) -> Maps:
+    """Read the maps of the surroundings that photos show, at the exposure of the observations.
+
+    Args:
+        folder: Folder of the stage `urm`.
+        exposures: Relative exposure of each photo.
+    """
+    files = {photo: folder / "background" / f"{photo}.exr" for photo in exposures}
+    return {photo: read_rgb_exr(file) / exposures[photo] for photo, file in files.items() if file.is_file()}
+
+
+def _with_background(block: Block, maps: Maps, rotations: Rotations) -> Block:
+    """Return the block with the surroundings that its photos show."""
+    shown = [
+        Background.from_map(maps[photo], rotations.get(photo, np.eye(3)), block.unit)
+        for photo in block.photos
+        if photo in maps
+    ]
+    return msgspec.structs.replace(block, background=concatenate_backgrounds(shown) if shown else None)
 
 
 def usable_observations(observations: Observations) -> Observations:

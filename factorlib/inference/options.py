@@ -26,6 +26,9 @@ class SolveOptions(Struct, frozen=True):
     interreflection: Literal["auto", "on", "off"] = "auto"
     """Light that surfaces send each other, as the photo shows it; needs self_shadowing.  auto: on, if the
     marginal likelihood supports it very strongly (log Bayes factor over 5)."""
+    background: Literal["auto", "off"] = "auto"
+    """Surroundings that photos show, as observations of the light; auto: used unless the marginal likelihood of the
+    objects is strongly against it (log Bayes factor below -15)."""
     tone: Literal["auto", "off"] = "auto"
     """Tone curve of a photo beyond its encoding; auto: used if held-out observations support it by two standard errors
     and their loss is a quarter higher without it."""

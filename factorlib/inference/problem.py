@@ -105,6 +105,12 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Return the problem with shadows or interreflection switched off where the argument is False."""
         return self.with_blocks([block.with_effects(shadows, bounces) for block in self.blocks])
 
+    def with_backgrounds(self, accepted: Sequence[bool]) -> JointProblem:
+        """Return the problem without the backgrounds of the lights for which `accepted` is False."""
+        pairs = zip(self.blocks, accepted, strict=True)
+        blocks = [block if keep else msgspec.structs.replace(block, background=None) for block, keep in pairs]
+        return self.with_blocks(blocks)
+
     def with_blocks(self, blocks: list[Block]) -> JointProblem:
         """Return the problem with other observations."""
         return msgspec.structs.replace(self, blocks=blocks)

@@ -39,6 +39,7 @@ from factorlib.inference.model_selection import (
     Losses,
     compare_models,
     held_out_losses,
+    select_backgrounds,
     select_effects,
 )
 from factorlib.inference.optimizer import descend_light
@@ -406,6 +407,9 @@ def fit_trial(
 
     choices = SolveOptions(self_shadowing="on", interreflection="on", seed=seed)
     effects = select_effects(reliable, start(reliable, TRIAL_CELLS), choices, fitting)
+    lit = reliable.with_effects(effects.shadows.accepted, effects.interreflection.accepted)
+    selection = select_backgrounds(lit, effects.fit, choices, fitting)
+    effects = effects.with_fit(selection.fit, backgrounds=selection.evidence)
     problem = effects.effective_problem(problem)
     fit = fit_problem(
         problem.subsample(OBSERVATIONS, seed), refine_cells(effects.fit, CELLS, problem), prior, START_SCHEDULE, tick

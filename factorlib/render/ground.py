@@ -1,9 +1,4 @@
-"""The ground plane of a photo: given in dataset.yaml, or the plane on which an object would rest.
-
-A rigid object comes to rest on a facet of its convex hull (Goldberg et al., "Part pose statistics", 1999). `trimesh`
-computes the probability of each facet after a random drop.  The ground is the likeliest of the facets that look down,
-on the mean over all photos of the object.  People photograph things upright, a tall one from below and a low one from
-above.
+"""Objects on the ground plane of a photo, which dataset.yaml gives, or on which an object rests.
 
 Objects on a grey floor, which receives their shadow and fades out around them, are w L₁ + (1 − w) L₀, w = max(W, f).
 L₁ and L₀ are path-traced with the floor and without it.  W is the share of a pixel that objects fill.  f falls from 1
@@ -12,45 +7,24 @@ beneath the objects to 0 at `REACH` of their size.
 
 from typing import Any
 
-import msgspec
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
 from factorlib.export.exported_scene import DIRECT
+from factorlib.geometry.ground import Plane, resting_plane
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rigid, transform
 
-# Largest mean angle between the object's upright axis and the cameras': photos look down, and are held askew.
-MOST_TILT_DEG = 50.0
 REACH = 3.0  # radius of a floor, in half extents of the objects
 SOLID = 0.3  # share of the radius within which the floor does not fade
 HAIR = 1e-4  # depth of the floor below the plane, in half extents: surfaces must not touch
 COVERAGE_SAMPLES = 16
 
 
-class Plane(msgspec.Struct, frozen=True):
-    """A plane in the world: a point on it and its unit normal, toward the objects."""
-
-    normal: Float[np.ndarray, "3"]
-    point: Float[np.ndarray, "3"]
-
-    def onto(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return the orthogonal projections of `points` onto the plane."""
-        return points - ((points - self.point) @ self.normal)[:, None] * self.normal
-
-    def hit(self, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return the intersections of rays from the origin with the plane's upper side; NaN if a ray misses it."""
-        down = rays @ self.normal
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (self.point @ self.normal) / down
-        return np.where((distance > 0) & (down < 0), distance, np.nan)[:, None] * rays
-
-
-def resting_plane(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
+def ground_below(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
     """Return the plane, in the world, on which an object rests.
 
     Args:
@@ -64,23 +38,14 @@ def resting_plane(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None 
     rotation = placed.world_from_object[:3, :3]
     rotation = rotation / np.cbrt(np.linalg.det(rotation))
     uprights = rotation.T[:, 1][None] if uprights is None else uprights
-    vertices = placed.mesh.vertices
-    # stable poses of the convex hull, and their probabilities
-    poses, chances = trimesh.poses.compute_stable_poses(
-        trimesh.convex.convex_hull(vertices - vertices.mean(axis=0)), n_samples=1
-    )
-    normals = poses[:, 2, :3]  # z of the resting pose, in the object's frame
-    upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
-    if not upright.any():
+    plane = resting_plane(placed.mesh.vertices, placed.vertices, rotation, uprights)
+    if plane is None:
         raise InputError(
             f"no stable pose of the object '{placed.name}' is upright in its photos, so its ground is unknown",
             key="beside",
             cure="name another object, or give the photo's `ground` in dataset.yaml",
         )
-    # the likeliest pose among the upright ones; the plane touches the lowest vertex
-    normal = rotation @ normals[np.argmax(np.where(upright, chances, -1))]
-    lowest = placed.vertices[np.argmin(placed.vertices @ normal)]
-    return Plane(normal / np.linalg.norm(normal), lowest)
+    return plane
 
 
 def height_over(plane: Plane, placed: PlacedMesh) -> float:

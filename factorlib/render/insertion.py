@@ -36,9 +36,10 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.export.exported_scene import ALL_BOUNCES
+from factorlib.geometry.ground import Plane
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
-from factorlib.render.ground import Plane, disk, height_over, smooth_step
+from factorlib.render.ground import disk, height_over, smooth_step
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
 from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3

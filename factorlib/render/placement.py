@@ -18,9 +18,10 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import rotation_of_vector
+from factorlib.geometry.ground import Plane
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
-from factorlib.render.ground import Plane, height_over, rotation_between
+from factorlib.render.ground import height_over, rotation_between
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh
 from factorlib.tracing.scene import rigid
 

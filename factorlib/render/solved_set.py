@@ -12,6 +12,7 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera
+from factorlib.geometry.ground import Plane
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import apply_tone, invert_tone
@@ -20,7 +21,7 @@ from factorlib.meshes.mesh import Mesh, scale_mesh, without_paint
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, ViewCamera, is_light_file, is_mesh_file, read_table
-from factorlib.render.ground import Plane, resting_plane
+from factorlib.render.ground import ground_below
 from factorlib.render.insertion import GroundSurface
 from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, identity_tone, with_sun
 from factorlib.results.lobe_table import read_photo_light
@@ -191,7 +192,7 @@ class SolvedSet:
             poses = [self.poses[each].objects[obj.name] for each, obj in self._objects_of(mesh)]
             trusted = [pose for pose in poses if not pose.left_out] or poses
             uprights = np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
-            return GroundSurface(resting_plane(neighbour, uprights))
+            return GroundSurface(ground_below(neighbour, uprights))
         normal = YUP_FROM_CAMERA @ np.array(ground_entry.normal)
         return GroundSurface(
             Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(ground_entry.point)), ground_entry.diffuse

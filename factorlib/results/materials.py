@@ -166,6 +166,7 @@ class Model(msgspec.Struct, frozen=True):
         interreflection_chosen_by: log Bayes factor of the model with it; empty if not tried
         splitting_chosen_by: decision of each splitting of cells
         suns_chosen_by: decision on a sun, by illumination
+        background_chosen_by: decision on the surroundings that photos show, by illumination
         tone: curves of the photos that have one
         tone_chosen_by: decision on tone curves, by illumination
         distance: distance of each light that is not at infinity, in RMS distances of a photo's points from their middle
@@ -183,6 +184,7 @@ class Model(msgspec.Struct, frozen=True):
     light_prior: bool = False
     splitting_chosen_by: list[Decision] = []
     suns_chosen_by: dict[str, Decision] = {}
+    background_chosen_by: dict[str, Decision] = {}
     tone: dict[str, Tone] = {}
     tone_chosen_by: dict[str, Decision] = {}
     distance: dict[str, Positive] = {}

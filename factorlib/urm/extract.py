@@ -50,6 +50,16 @@ def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float
     return labelled & agrees & facing & (photo["valid"] > 0.5) & (geometry["confidence"] > least_confidence)
 
 
+def surface_centre(geometry: Channels) -> Float[np.ndarray, "3"]:
+    """Return the mean of the visible surface points, weighted by confidence, in the camera's frame; 0 without any."""
+    view, depth = np.stack([geometry[f"view.{a}"] for a in "xyz"], axis=-1), geometry["depth"]
+    shown = (depth > 0) & (view[..., 2] < 0)
+    if not shown.any():
+        return np.zeros(3)
+    places = view[shown] * (depth[shown] / view[shown][:, 2])[:, None]
+    return np.average(places, axis=0, weights=geometry["confidence"][shown] + 1e-6)
+
+
 def extract_observations(
     photo: Channels, geometry: Channels, source: PhotoSource, materials: Sequence[str], least_confidence: float = 0.0
 ) -> Observations:

@@ -8,10 +8,11 @@ import trimesh
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
+from factorlib.geometry.ground import Plane
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
-from factorlib.render.ground import Plane, on_floor, resting_plane
+from factorlib.render.ground import ground_below, on_floor
 from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compare_shadow, insert_object, shadow_match
 from factorlib.render.photo_scene import (
     ALL_BOUNCES,
@@ -104,7 +105,7 @@ def test_lobes_and_their_map_are_the_same_light(pair, angle):
 
 def test_a_box_stands_on_its_largest_side_that_looks_down():
     tilted = about((1, 0, 0), 25)
-    plane = resting_plane(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))
+    plane = ground_below(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))
     assert np.allclose(plane.normal, tilted @ [0, 1, 0], atol=1e-6)
     assert (plane.point - np.array([0, 0, -5])) @ plane.normal == pytest.approx(-0.5)
 
@@ -141,7 +142,7 @@ def test_a_sun_lights_a_ball_as_its_irradiance_says_and_stands_where_its_axis_sa
 
 def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(pair):
     left = pair.objects[0]
-    plane = resting_plane(left)
+    plane = ground_below(left)
     spot = spot_beside(pair, plane, left, 0.5, 1.0)
     new = standing_mesh("new", box(0.2, 0.3, 3.0), ("red",), np.array([0, 0, 1.0]), 40, spot)
     along = (new.vertices - plane.point) @ plane.normal

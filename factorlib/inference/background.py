@@ -1,0 +1,91 @@
+"""Prior on a light, given the surroundings that its photos show.
+
+`factorlib.urm.background` says which radiance L arrives from the directions that a photo shows.  A cell is observed as
+
+    b = log Σ_j w_j L_j / Σ_j w_j,     w_j = exp(λ(z · ω_j − 1)) Ω_j,     coverage c = Σ_j w_j / ∫ exp(λ(z · ω − 1)) dω,
+
+with the cell's own lobe as the kernel, over the seen texels j of direction ω_j and solid angle Ω_j.  Its error has the
+standard deviation `DEVIATION`/√c: surroundings are neither diffuse nor where the ground plane says, and objects shade
+the ground below them.  For u ~ N(0, Q⁻¹) that gives u ~ N(m, P⁻¹) with
+
+    P = Q + D,     P m = D b,     D = diag(c)/DEVIATION².                                                            (1)
+
+Radiance of surroundings is absolute, so a background also fixes the scale between reflectances and lights.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import cho_solve, cholesky
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.inference.lights import Light
+from factorlib.light.lobes import lobe_energy
+
+DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is seen whole
+SHARPEST = 350.0  # largest λ of a kernel, about as wide as a texel
+DARKEST = 1e-3  # least radiance, in units of the block
+
+
+class Background(msgspec.Struct, frozen=True):
+    """Radiance of the surroundings in the k directions that the photos of one light show.
+
+    Attributes:
+        direction: Unit vectors in the light's frame.
+        radiance: Radiance in the unit of the block.
+        solid_angle: Solid angle of each direction's texel.
+    """
+
+    direction: Float[np.ndarray, "k 3"]
+    radiance: Float[np.ndarray, "k 3"]
+    solid_angle: Float[np.ndarray, " k"]
+
+    @staticmethod
+    def from_map(lat_long: Float[np.ndarray, "h w 3"], rotation: Float[np.ndarray, "3 3"], unit: float) -> Background:
+        """Return the texels of a map that are not 0.
+
+        Args:
+            lat_long: Map of `factorlib.urm.background`, in the camera's y-up frame.
+            rotation: Rotation from the camera's frame (OpenCV) to the light's.
+            unit: Unit of the block.
+        """
+        height, width = lat_long.shape[:2]
+        seen = lat_long.any(axis=-1)
+        direction = lat_long_directions(height, width)[seen] @ YUP_FROM_CAMERA @ np.asarray(rotation).T
+        solid_angle = np.broadcast_to(lat_long_solid_angles(height, width)[:, None], (height, width))[seen]
+        return Background(direction, lat_long[seen] / unit, solid_angle)
+
+    def observe(self, light: Light) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """Return c and b of each cell; c is 0 for suns."""
+        sharpness = np.minimum(light.sharpness, SHARPEST)
+        kernel = np.exp(sharpness[:, None] * (light.axis @ self.direction.T - 1)) * self.solid_angle
+        weight = kernel.sum(1)
+        mean = kernel @ self.radiance / np.maximum(weight, 1e-300)[:, None]
+        coverage = np.where(light.suns, 0.0, np.minimum(weight / lobe_energy(sharpness), 1))
+        return coverage, np.log(np.maximum(mean, DARKEST))
+
+
+def concatenate_backgrounds(backgrounds: list[Background]) -> Background | None:
+    """Return the background of several photos; None without any direction."""
+    fields = (np.concatenate([getattr(b, name) for b in backgrounds]) for name in Background.__struct_fields__)
+    return Background(*fields) if any(len(b.direction) for b in backgrounds) else None
+
+
+def condition_on_background(
+    Q: Float[np.ndarray, "3p 3p"], background: Background, light: Light
+) -> tuple[Float[np.ndarray, " 3p"], Float[np.ndarray, "3p 3p"], float]:
+    """Return mean and precision of u given the background, and the precision's log determinant, by (1).
+
+    Args:
+        Q: Precision of u, channel by channel, of mean 0.
+        background: Surroundings that the photos show.
+        light: Cells and suns of the light.
+    """
+    coverage, log_radiance = background.observe(light)
+    D = np.tile(coverage / DEVIATION**2, 3)
+    P = Q + np.diag(D)
+    factor = cholesky(P, lower=True, check_finite=False)
+    mean = cho_solve((factor, True), D * log_radiance.T.reshape(-1), check_finite=False)
+    return mean, P, 2 * float(np.log(np.diag(factor)).sum())
