@@ -233,19 +233,26 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
     shown = [block.background is not None and not light.fixed.any() for block, light in pairs]
     if options.background == "off" or not any(shown):
         return Selection(before, [Decision(False) for _ in shown])
-    sample = comparison_sample(problem, options).with_backgrounds(shown)
-    fit = run_fit("background", sample, before, BACKGROUND_SCHEDULE)
+    sample = comparison_sample(problem, options)
     without = sample.with_backgrounds([False] * len(shown))
-    start = run_fit("background", without, fit, TEMPERED_LIGHTS)
-    values = [run_fit("background", model, start, LIGHTS_ONLY).light_values for model in (without, sample)]
-    factors = (np.array(values[0]) - values[1]) / 2
+    accepted = np.array(shown)
+    factors = np.zeros(len(shown))
+    fit = before
+    while accepted.any():
+        model = sample.with_backgrounds(accepted.tolist())
+        fit = run_fit("background", model, fit, BACKGROUND_SCHEDULE)
+        start = run_fit("background", without, fit, TEMPERED_LIGHTS)
+        values = [run_fit("background", each, start, LIGHTS_ONLY).light_values for each in (without, model)]
+        factors = np.where(accepted, (np.array(values[0]) - values[1]) / 2, factors)
+        # the worst first: they shift the scale of all
+        doubtful = accepted & (factors < min(-BACKGROUND_DOUBT, factors[accepted].min() / 2))
+        if not doubtful.any():
+            break
+        accepted &= ~doubtful
     evidence = [
-        Decision(bool(factor > -BACKGROUND_DOUBT), log_bayes_factor=float(factor)) if has else Decision(False)
-        for factor, has in zip(factors, shown, strict=True)
+        Decision(bool(keep), log_bayes_factor=float(factor)) if has else Decision(False)
+        for keep, factor, has in zip(accepted, factors, shown, strict=True)
     ]
-    accepted = [decision.accepted for decision in evidence]
-    if accepted != shown:
-        fit = run_fit("background", sample.with_backgrounds(accepted), fit, BACKGROUND_SCHEDULE)
     return Selection(fit, evidence)
 
 

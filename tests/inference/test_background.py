@@ -1,0 +1,90 @@
+"""A light is known better, and in absolute terms, where its photos show the surroundings."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
+from factorlib.inference.background import DEVIATION, Background, condition_on_background
+from factorlib.inference.gauge import has_free_factor
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.options import SolveOptions
+from factorlib.inference.start import start_from_photos
+from factorlib.scenes.joint_problems import MATERIALS
+from tests.inference.made_lights import PRIOR, drawn, on_even_cells, photographed
+
+QUICK = SolveOptions(cells=60, splittings=0, observations=300, tone="off", distance="off")
+
+
+def lower_half(light, unit=1.0, factor=1.0) -> Background:
+    """What a camera that looks down at the objects shows of their light."""
+    directions = lat_long_directions(24, 48)
+    radiance = light.lobes.radiance((directions @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(24, 48, 3)
+    return Background.from_map(factor * radiance * (directions[..., 1:2] < 0), np.eye(3), unit)
+
+
+def test_the_prior_given_a_background_is_that_of_gaussian_regression():
+    light = on_even_cells(drawn(3, 80))
+    Q, _ = PRIOR.precision(light.axis)
+    background = lower_half(light)
+    mean, P, log_determinant = condition_on_background(Q, background, light)
+    # the slow way, by covariances: K = Q⁻¹, m = K_s (K_ss + N)⁻¹ b, P⁻¹ = K − K_s (K_ss + N)⁻¹ K_sᵀ over seen cells s
+    coverage, b = background.observe(light)
+    s = np.flatnonzero(np.tile(coverage, 3) > 1e-9)
+    K, D = np.linalg.inv(Q), np.tile(coverage, 3) / DEVIATION**2
+    gain = K[:, s] @ np.linalg.inv(K[np.ix_(s, s)] + np.diag(1 / D[s]))
+    np.testing.assert_allclose(mean, gain @ b.T.reshape(-1)[s], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.inv(P), K - gain @ K[s], atol=1e-6)
+    assert log_determinant == pytest.approx(np.linalg.slogdet(P)[1])
+
+
+def test_a_cell_sees_the_mean_of_its_own_part_of_the_surroundings():
+    light = on_even_cells(drawn(4, 300))
+    coverage, b = lower_half(light, unit=2.0).observe(light)
+    below = light.axis[:, 1] > 0.3  # y points down
+    assert coverage[below].min() > 0.95 and coverage[light.axis[:, 1] < -0.3].max() < 0.05
+    error = b[below] - (light.log_radiance.T[below] - np.log(2))
+    assert abs(np.median(error)) < 0.2 and error.std() < 0.5 * light.log_radiance.std()
+
+
+def test_a_background_turns_with_the_camera_of_a_light_that_is_fixed_to_the_world():
+    turn = Rotation.from_rotvec([0.2, 0.5, -0.3]).as_matrix()
+    lat_long = np.zeros((24, 48, 3))
+    lat_long[15, 7] = 1.0
+    still, turned = (Background.from_map(lat_long, rotation, 1.0) for rotation in (np.eye(3), turn))
+    np.testing.assert_allclose(turned.direction, still.direction @ turn.T)
+
+
+@pytest.fixture(scope="module")
+def lit():
+    """Spheres in three lights, and the lights in the units of their blocks."""
+    problem, true = photographed(6, 3, cells=60, size=12)
+    blocks = [
+        msgspec.structs.replace(block, background=lower_half(light)) for block, light in zip(problem.blocks, true)
+    ]
+    return problem.with_blocks(blocks)
+
+
+def log_scale(solution) -> float:
+    """Error of the log scale of all reflectances."""
+    return abs(np.median(np.log(solution.point.materials.diffuse / MATERIALS.diffuse)))
+
+
+def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_left_out(lit):
+    solution = solve(lit, start_from_photos(3), QUICK)
+    assert [each.accepted for each in solution.backgrounds] == [True] * 3
+    assert log_scale(solution) < 0.2
+    black = msgspec.structs.replace(lit.blocks[1].background, radiance=lit.blocks[1].background.radiance * 2e-3)
+    blocks = [lit.blocks[0], msgspec.structs.replace(lit.blocks[1], background=black), lit.blocks[2]]
+    solution = solve(lit.with_blocks(blocks), start_from_photos(3), QUICK)
+    assert [each.accepted for each in solution.backgrounds] == [True, False, True]
+    assert log_scale(solution) < 0.2
+    off = solve(lit, start_from_photos(3), msgspec.structs.replace(QUICK, background="off"))
+    assert not any(each.accepted for each in off.backgrounds) and log_scale(off) > 0.3
+
+
+def test_the_factor_of_a_component_is_free_unless_a_background_fixes_it(lit):
+    names = [block.name for block in lit.blocks]
+    assert not has_free_factor(lit.blocks, names)
+    assert has_free_factor(lit.with_backgrounds([False] * 3).blocks, names)
