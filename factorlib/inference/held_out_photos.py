@@ -37,7 +37,8 @@ def fit_held_out_lights(
     Returns:
         The lobes by illumination, in scene radiance, and each photo's factor on its light.
     """
-    problem = solution.effective_problem(problem).subsample(options.observations, options.seed)
+    problem = problem.with_effects(solution.shadows.accepted, solution.interreflection.accepted)
+    problem = problem.subsample(options.observations, options.seed)
     materials = solution.point.materials
     start = Point(materials, [constant_light(block, materials, options.cells) for block in problem.blocks])
     fit = FitRunner().fit("held-out photos", problem, initial_fit(start), SCHEDULE)

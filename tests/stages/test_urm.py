@@ -33,7 +33,7 @@ def step(folder, poses: dict[str, Pose]):
         (folder / stage).mkdir(parents=True)
     channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
     write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "depth": maps.depth, "confidence": inside})
-    channels = dict.fromkeys("RGB", inside) | {f"clipped.{c}": 0 * inside for c in "RGB"}
+    channels = dict.fromkeys("RGB", inside) | {"left_out": 0 * inside} | {f"clipped.{c}": 0 * inside for c in "RGB"}
     write_exr(folder / "masks" / "a.exr", {**channels, "label": maps.label, "valid": inside})
     size = [CAMERA.width, CAMERA.height]
     write_json(folder / "masks" / "a.json", {"width": size[0], "height": size[1], "factor": 1, "original_size": size})
@@ -44,6 +44,7 @@ def step(folder, poses: dict[str, Pose]):
     facts = {
         "dataset.materials": ["white"],
         "dataset.light": {"illumination": "room", "world_from_camera": None},
+        "dataset.ground": {"ground": None},
         "dataset.objects": {
             "camera": {},
             "objects": [{"name": name, "mesh": "ball"} for name in poses],
@@ -102,7 +103,8 @@ def test_urm_and_export_place_a_scaled_mesh_alike(tmp_path, two):
     entry = msgspec.convert({"rotation": turn.tolist(), "translation": shift, "scale": scale}, ObjectPose)
     poses, given = dict.fromkeys(("left", "right"), entry), mesh_of([ball(1.0, 3)])
     there = (given.vertices * scale) @ turn.T + shift
-    assert np.allclose(urm.read_occluders(two, poses).centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)
+    scaled = urm.read_meshes(two, poses)["left"]
+    assert np.allclose(entry.pose.apply(scaled.vertices).mean(0), there.mean(0), atol=1e-4)
     (tmp_path / "meshes").mkdir()
     own = msgspec.convert(two.facts["dataset.objects"], ObjectsSlice)
     shape = MeshFiles(two, tmp_path, ["white"], 60.0, {}).shapes(own.objects[0], own.meshes, poses)[0]
