@@ -10,9 +10,13 @@ import msgspec
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from scipy.spatial import QhullError
+
+from factorlib.geometry.sphere import fibonacci_sphere
 
 # Largest mean angle between the object's upright axis and the cameras': photos look down, and are held askew.
 MOST_TILT_DEG = 50.0
+EXTREMES = 400  # number of directions whose farthest vertices are the hull's: its facets are few
 
 
 class Plane(msgspec.Struct, frozen=True):
@@ -39,7 +43,7 @@ def resting_plane(
     rotation: Float[np.ndarray, "3 3"],
     uprights: Float[np.ndarray, "k 3"],
 ) -> Plane | None:
-    """Return the plane on which an object rests; None if no stable pose is upright in its photos.
+    """Return the plane on which an object rests; None if it is flat, or no stable pose is upright in its photos.
 
     Args:
         vertices: Vertices in the object's frame.
@@ -47,10 +51,16 @@ def resting_plane(
         rotation: Rotation from the object's frame to that of the result.
         uprights: Unit up vectors of the cameras that see the object, in its frame.
     """
-    # stable poses of the convex hull, and their probabilities
-    hull = trimesh.convex.convex_hull(vertices - vertices.mean(axis=0))
-    poses, chances = trimesh.poses.compute_stable_poses(hull, n_samples=1)
-    normals = poses[:, 2, :3]  # z of the resting pose, in the object's frame
+    # stable poses of the convex hull of extreme vertices, and their probabilities
+    centred = vertices - vertices.mean(axis=0)
+    extreme = np.unique([np.argmax(centred @ direction) for direction in fibonacci_sphere(EXTREMES)])
+    try:
+        hull = trimesh.convex.convex_hull(centred[extreme])
+        with np.errstate(invalid="ignore"):
+            poses, chances = trimesh.poses.compute_stable_poses(hull, n_samples=1)
+    except (QhullError, ValueError):  # a flat object has no hull
+        return None
+    normals = poses.reshape(-1, 4, 4)[:, 2, :3]  # z of the resting pose, in the object's frame
     upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
     if not upright.any():
         return None

@@ -284,7 +284,9 @@ def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp
 def test_every_part_reports_what_it_does(whole):
     _, events = whole
     visibilities = [event.phase for event in events]
-    assert set(visibilities) <= set(ALL) and set(ALL) - {"shadows and bounces", "background", "suns"} <= set(visibilities)
+    assert set(visibilities) <= set(ALL) and set(ALL) - {"shadows and bounces", "background", "suns"} <= set(
+        visibilities
+    )
     assert sorted(visibilities, key=ALL.index) == visibilities and all(np.isfinite(event.loss) for event in events)
     assert [event.round for event in events] == sorted(event.round for event in events)
 

@@ -8,7 +8,7 @@ import trimesh
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
-from factorlib.geometry.ground import Plane
+from factorlib.geometry.ground import Plane, resting_plane
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
@@ -108,6 +108,12 @@ def test_a_box_stands_on_its_largest_side_that_looks_down():
     plane = ground_below(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))
     assert np.allclose(plane.normal, tilted @ [0, 1, 0], atol=1e-6)
     assert (plane.point - np.array([0, 0, -5])) @ plane.normal == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize("depth", [0.0, 1e-12])
+def test_a_flat_object_rests_nowhere(depth):
+    card = np.random.default_rng(0).random((50, 3)) * [1, 1, depth]
+    assert resting_plane(card, card, np.eye(3), np.array([[0.0, 1.0, 0.0]])) is None
 
 
 AXIS = np.array([0.6, -0.48, -0.64])
