@@ -1,21 +1,23 @@
 """Ground plane on which an object rests.
 
-A rigid object comes to rest on a facet of its convex hull (Goldberg et al., "Part pose statistics", 1999).  `trimesh`
-computes the probability of each facet after a random drop.  The ground is the likeliest of the facets that look down,
-on the mean over all photos of the object.  People photograph things upright, a tall one from below and a low one from
-above.
+A rigid object comes to rest on a facet of its convex hull above which its centre of mass lies, here that of the hull.
+The chance of a facet after a random drop is about its solid angle, seen from that centre (Goldberg et al., "Part pose
+statistics", 1999, who add the chances of unstable facets that topple onto it).  The ground is the likeliest of the
+facets that look down, on the mean over all photos of the object.  People photograph things upright, a tall one from
+below and a low one from above.
 """
 
 import msgspec
 import numpy as np
-import trimesh
 from jaxtyping import Float
-from scipy.spatial import QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 from factorlib.geometry.sphere import fibonacci_sphere
 
 # Largest mean angle between the object's upright axis and the cameras': photos look down, and are held askew.
 MOST_TILT_DEG = 50.0
+FOOTING = 1e-9  # most height of the foot above the hull, in longest sides
+COPLANAR = 1e-9  # most difference of the cosine between normals of one facet from 1
 EXTREMES = 400  # number of directions whose farthest vertices are the hull's: its facets are few
 
 
@@ -51,20 +53,40 @@ def resting_plane(
         rotation: Rotation from the object's frame to that of the result.
         uprights: Unit up vectors of the cameras that see the object, in its frame.
     """
-    # stable poses of the convex hull of extreme vertices, and their probabilities
-    centred = vertices - vertices.mean(axis=0)
-    extreme = np.unique([np.argmax(centred @ direction) for direction in fibonacci_sphere(EXTREMES)])
     try:
-        hull = trimesh.convex.convex_hull(centred[extreme])
-        with np.errstate(invalid="ignore"):
-            poses, chances = trimesh.poses.compute_stable_poses(hull, n_samples=1)
-    except (QhullError, ValueError):  # a flat object has no hull
+        ups, chances = stable_poses(vertices)
+    except QhullError:  # a flat object has no hull
         return None
-    normals = poses.reshape(-1, 4, 4)[:, 2, :3]  # z of the resting pose, in the object's frame
-    upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
+    upright = (ups @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
     if not upright.any():
         return None
     # the likeliest pose among the upright ones; the plane touches the lowest vertex
-    normal = rotation @ normals[np.argmax(np.where(upright, chances, -1))]
+    normal = rotation @ ups[np.argmax(np.where(upright, chances, -1))]
     lowest = placed[np.argmin(placed @ normal)]
     return Plane(normal / np.linalg.norm(normal), lowest)
+
+
+def stable_poses(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]]:
+    """Return the upward directions of the poses in which an object rests, in its frame, and their chances.
+
+    Raises:
+        QhullError: The object is flat.
+    """
+    extreme = np.unique([np.argmax(vertices @ direction) for direction in fibonacci_sphere(EXTREMES)])
+    points = vertices[extreme] - vertices.mean(axis=0)
+    hull = ConvexHull(points)
+    outward, offset = hull.equations[:, :3], hull.equations[:, 3]
+    # centre of mass, from tetrahedra between the facets and a point inside
+    corners = points[hull.simplices] - points.mean(axis=0)
+    volume = np.abs(np.linalg.det(corners))
+    centre = points.mean(axis=0) + volume @ corners.mean(axis=1) * 0.75 / volume.sum()
+    # a facet is stable if the foot of the centre lies on the hull
+    foot = centre - (outward @ centre + offset)[:, None] * outward
+    stable = (foot @ outward.T + offset < FOOTING * np.ptp(points, axis=0).max()).all(axis=1)
+    # solid angle of each triangle (Van Oosterom and Strackee 1983), summed over those of one plane
+    seen = points[hull.simplices] - centre
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    cosines = sum(np.sum(seen[:, i] * seen[:, i - 1], axis=1) for i in range(3))
+    solid_angle = 2 * np.arctan2(np.abs(np.linalg.det(seen)), 1 + cosines)
+    chances = (outward @ outward.T > 1 - COPLANAR) @ solid_angle / (4 * np.pi)
+    return -outward[stable], chances[stable]
