@@ -9,7 +9,7 @@ from factorlib.dataset.schema import ObjectsSlice
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.images.exr import write_exr
+from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.poses import ObjectPose
@@ -95,6 +95,18 @@ def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_pat
     place = {(x, y): k for k, (x, y) in enumerate(zip(whole.x.tolist(), whole.y.tolist()))}
     rows = [place[at] for at in zip(part.x.tolist(), part.y.tolist())]
     np.testing.assert_array_equal(part.visibility, whole.visibility[rows])
+
+
+def test_the_surroundings_are_written_with_the_observations_and_black_ones_say_nothing(tmp_path, two):
+    assert not read_rgb_exr(run(tmp_path / "black", two).parent / "background" / "a.exr").any()
+    channels = read_exr(two["masks"] / "a.exr")
+    grey = {c: np.where(channels["label"] > 0, channels[c], 0.25) for c in "RGB"}
+    (tmp_path / "masks").mkdir()
+    write_exr(tmp_path / "masks" / "a.exr", channels | grey)
+    (tmp_path / "masks" / "a.json").write_bytes((two["masks"] / "a.json").read_bytes())
+    photo = msgspec.structs.replace(two, folders={**two.folders, "masks": tmp_path / "masks"})
+    found = read_rgb_exr(run(tmp_path / "grey", photo).parent / "background" / "a.exr")
+    assert found.any() and np.allclose(found[found.any(-1)], 0.25)
 
 
 def test_urm_and_export_place_a_scaled_mesh_alike(tmp_path, two):
