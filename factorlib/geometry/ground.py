@@ -16,13 +16,13 @@ from factorlib.geometry.sphere import fibonacci_sphere
 
 # Largest mean angle between the object's upright axis and the cameras': photos look down, and are held askew.
 MOST_TILT_DEG = 50.0
-FOOTING = 1e-9  # most height of the foot above the hull, in longest sides
-COPLANAR = 1e-9  # most difference of the cosine between normals of one facet from 1
-EXTREMES = 400  # number of directions whose farthest vertices are the hull's: its facets are few
+FOOTING = 1e-9  # largest height of the foot above the hull, in longest sides
+COPLANAR = 1e-9  # largest 1 − cosine between normals of one facet
+EXTREMES = 400  # number of directions whose farthest vertices make the hull, so that it has few facets
 
 
 class Plane(msgspec.Struct, frozen=True):
-    """Plane: a point on it and its unit normal, toward the objects, in one frame."""
+    """Plane, by a point on it and its unit normal toward the objects, in one frame."""
 
     normal: Float[np.ndarray, "3"]
     point: Float[np.ndarray, "3"]
@@ -84,9 +84,9 @@ def stable_poses(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, 
     foot = centre - (outward @ centre + offset)[:, None] * outward
     stable = (foot @ outward.T + offset < FOOTING * np.ptp(points, axis=0).max()).all(axis=1)
     # solid angle of each triangle (Van Oosterom and Strackee 1983), summed over those of one plane
-    seen = points[hull.simplices] - centre
-    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
-    cosines = sum(np.sum(seen[:, i] * seen[:, i - 1], axis=1) for i in range(3))
-    solid_angle = 2 * np.arctan2(np.abs(np.linalg.det(seen)), 1 + cosines)
+    corners = points[hull.simplices] - centre
+    corners /= np.linalg.norm(corners, axis=2, keepdims=True)
+    cosines = sum(np.sum(corners[:, i] * corners[:, i - 1], axis=1) for i in range(3))
+    solid_angle = 2 * np.arctan2(np.abs(np.linalg.det(corners)), 1 + cosines)
     chances = (outward @ outward.T > 1 - COPLANAR) @ solid_angle / (4 * np.pi)
     return -outward[stable], chances[stable]

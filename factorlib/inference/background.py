@@ -4,9 +4,9 @@
 
     b = log Σ_j w_j L_j / Σ_j w_j,     w_j = exp(λ(z · ω_j − 1)) Ω_j,     coverage c = Σ_j w_j / ∫ exp(λ(z · ω − 1)) dω,
 
-with the cell's own lobe as the kernel, over the seen texels j of direction ω_j and solid angle Ω_j.  Its error has the
-standard deviation `DEVIATION`/√c: surroundings are neither diffuse nor where the ground plane says, and objects shade
-the ground below them.  For u ~ N(0, Q⁻¹) that gives u ~ N(m, P⁻¹) with
+with the cell's own lobe as the kernel, over the observed texels j of direction ω_j and solid angle Ω_j.  Its error has
+the standard deviation `DEVIATION`/√c: surroundings are neither diffuse nor where the ground plane says, and objects
+shade the ground below them.  For u ~ N(0, Q⁻¹) that gives u ~ N(m, P⁻¹) with
 
     P = Q + D,     P m = D b,     D = diag(c)/DEVIATION².                                                            (1)
 
@@ -24,9 +24,9 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.inference.lights import Light
 from factorlib.light.lobes import lobe_energy
 
-DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is seen whole
+DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is observed whole
 SHARPEST = 350.0  # largest λ of a kernel, about as wide as a texel
-DARKEST = 1e-3  # least radiance, in units of the block
+LEAST_RADIANCE = 1e-3  # least radiance of a cell, in units of the block
 
 
 class Background(msgspec.Struct, frozen=True):
@@ -52,10 +52,10 @@ class Background(msgspec.Struct, frozen=True):
             unit: Unit of the block.
         """
         height, width = lat_long.shape[:2]
-        seen = lat_long.any(axis=-1)
-        direction = lat_long_directions(height, width)[seen] @ YUP_FROM_CAMERA @ np.asarray(rotation).T
-        solid_angle = np.broadcast_to(lat_long_solid_angles(height, width)[:, None], (height, width))[seen]
-        return Background(direction, lat_long[seen] / unit, solid_angle)
+        observed = lat_long.any(axis=-1)
+        direction = lat_long_directions(height, width)[observed] @ YUP_FROM_CAMERA @ np.asarray(rotation).T
+        solid_angle = np.broadcast_to(lat_long_solid_angles(height, width)[:, None], (height, width))[observed]
+        return Background(direction, lat_long[observed] / unit, solid_angle)
 
     def observe(self, light: Light) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
         """Return c and b of each cell; c is 0 for suns."""
@@ -64,7 +64,7 @@ class Background(msgspec.Struct, frozen=True):
         weight = kernel.sum(1)
         mean = kernel @ self.radiance / np.maximum(weight, 1e-300)[:, None]
         coverage = np.where(light.suns, 0.0, np.minimum(weight / lobe_energy(sharpness), 1))
-        return coverage, np.log(np.maximum(mean, DARKEST))
+        return coverage, np.log(np.maximum(mean, LEAST_RADIANCE))
 
 
 def concatenate_backgrounds(backgrounds: list[Background]) -> Background | None:

@@ -111,7 +111,7 @@ class SolveState(msgspec.Struct, frozen=True):
 
     def effective_problem(self, problem: JointProblem) -> JointProblem:
         """Return the problem under the chosen effects: with or without shadows, interreflection and backgrounds."""
-        accepted = [decision.accepted for decision in self.backgrounds] or [False] * len(problem.blocks)
+        accepted = [decision.accepted for decision in self.backgrounds]
         return problem.with_effects(self.shadows.accepted, self.interreflection.accepted).with_backgrounds(accepted)
 
 

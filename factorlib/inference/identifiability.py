@@ -216,7 +216,7 @@ def unlikely_curves(problem: JointProblem, point: Point) -> Iterator[str]:
 
 
 def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
-    """Yield a sentence for each set of lights with a strong common tint, fixed by interreflection.
+    """Yield a sentence for each set of lights with a strong common tint, fixed by interreflection or a background.
 
     There is none where the gauge of `factorlib.inference.gauge` makes lights grey, or where a material or a light is
     known.
@@ -235,8 +235,9 @@ def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
             colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))
             yield (
                 f"the lights of {', '.join(illuminations)} are R : G : B = {colour} on average, as interreflection "
-                "fixes it: reflectances have the opposite colour, if the lights were nearly white. "
-                'SET="solve.interreflection=off" makes the lights grey'
+                "or the surroundings in the photos fix it: reflectances have the opposite colour, if the lights were "
+                "nearly white. "
+                'SET="solve.interreflection=off solve.background=off" makes the lights grey'
             )
 
 

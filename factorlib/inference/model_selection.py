@@ -72,8 +72,8 @@ CURVATURES = (0.05, 0.1, 0.2)
 DISTANCE_SCHEDULE = FitSchedule(light_steps=2, descents=(2,), estimate_first=False)
 LIGHTS_ONLY = FitSchedule(light_steps=3, materials_fixed=True)
 TEMPERED_LIGHTS = FitSchedule(descents=(0, 3), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
-# A background is left out if the log Bayes factor against it is larger.  On seven made sets that of 40 true ones of 42
-# is at most 19, and of black ones, as cut-outs have, at least 19.
+# Log Bayes factor against a background above which it is left out.  It is three times `VERY_STRONG`, because objects
+# say little of most directions that a background shows, and the errors of the model count against it.
 BACKGROUND_DOUBT = 15.0
 
 Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem, start and schedule
@@ -158,7 +158,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
         options: Options of the user.
         run_fit: Function that fits a model.
     """
-    sample = comparison_sample(problem, options).with_backgrounds([False] * len(problem.blocks))
+    sample = comparison_sample(problem, options).with_backgrounds()
     hidden = any(block.visibility is not None for block in problem.blocks)
     shadows = options.self_shadowing if hidden else "off"
     bounces = options.interreflection if problem.has_bounces else "off"
@@ -230,13 +230,13 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
         run_fit: Function that fits a model.
     """
     pairs = zip(problem.blocks, before.point.lights, strict=True)
-    shown = [block.background is not None and not light.fixed.any() for block, light in pairs]
-    if options.background == "off" or not any(shown):
-        return Selection(before, [Decision(False) for _ in shown])
+    candidates = [block.background is not None and not light.fixed.any() for block, light in pairs]
+    if options.background == "off" or not any(candidates):
+        return Selection(before, [Decision(False) for _ in candidates])
     sample = comparison_sample(problem, options)
-    without = sample.with_backgrounds([False] * len(shown))
-    accepted = np.array(shown)
-    factors = np.zeros(len(shown))
+    without = sample.with_backgrounds()
+    accepted = np.array(candidates)
+    factors = np.zeros(len(candidates))
     fit = before
     while accepted.any():
         model = sample.with_backgrounds(accepted.tolist())
@@ -251,7 +251,7 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
         accepted &= ~doubtful
     evidence = [
         Decision(bool(keep), log_bayes_factor=float(factor)) if has else Decision(False)
-        for keep, factor, has in zip(accepted, factors, shown, strict=True)
+        for keep, factor, has in zip(accepted, factors, candidates, strict=True)
     ]
     return Selection(fit, evidence)
 

@@ -125,12 +125,12 @@ def read_backgrounds(folder: Path, exposures: Mapping[str, float]) -> Maps:
 
 def _with_background(block: Block, maps: Maps, rotations: Rotations) -> Block:
     """Return the block with the surroundings that its photos show."""
-    shown = [
+    backgrounds = [
         Background.from_map(maps[photo], rotations.get(photo, np.eye(3)), block.unit)
         for photo in block.photos
         if photo in maps
     ]
-    return msgspec.structs.replace(block, background=concatenate_backgrounds(shown) if shown else None)
+    return msgspec.structs.replace(block, background=concatenate_backgrounds(backgrounds) if backgrounds else None)
 
 
 def usable_observations(observations: Observations) -> Observations:

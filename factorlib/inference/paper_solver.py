@@ -91,12 +91,12 @@ def solve_paper(
     The unknowns are those of the joint solver: materials 0 … `materials`−1 and one light per block.
 
     Args:
-        problem: Observations and model; shadows and interreflection are ignored.
+        problem: Observations and model; shadows, interreflection and backgrounds are ignored.
         materials: Number of materials.
         options: Options.
         report: Called with each reported subset.
     """
-    problem = problem.with_effects(False, False)
+    problem = problem.with_effects(False, False).with_backgrounds()
     objective = PaperObjective(problem, materials, options)
     history = list[Event]()
     blocks = problem.blocks

@@ -105,9 +105,9 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Return the problem with shadows or interreflection switched off where the argument is False."""
         return self.with_blocks([block.with_effects(shadows, bounces) for block in self.blocks])
 
-    def with_backgrounds(self, accepted: Sequence[bool]) -> JointProblem:
-        """Return the problem without the backgrounds of the lights for which `accepted` is False."""
-        pairs = zip(self.blocks, accepted, strict=True)
+    def with_backgrounds(self, accepted: Sequence[bool] = ()) -> JointProblem:
+        """Return the problem with the backgrounds of those lights alone for which `accepted` is True."""
+        pairs = zip(self.blocks, accepted or [False] * len(self.blocks), strict=True)
         blocks = [block if keep else msgspec.structs.replace(block, background=None) for block, keep in pairs]
         return self.with_blocks(blocks)
 

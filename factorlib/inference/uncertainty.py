@@ -59,7 +59,10 @@ from factorlib.robust import robust_deviation
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 GIVEN = "; where a material or a light is known, that alone is fixed"
-ABSOLUTE = "; where surfaces light each other, that sum is known too, but to about a quarter of itself only"
+ABSOLUTE = (
+    "; where surfaces light each other or photos show the surroundings, that sum is known too, but to about a "
+    "quarter of itself only"
+)
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
 # Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
 # roughness.  About 68 % of true values then lie within one standard error on the sets that settings were chosen on

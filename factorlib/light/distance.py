@@ -44,6 +44,11 @@ def finite_distance_cosines(place: A, normal: A, view: A, axis: A, curvature: fl
     return nz.clip(-1.0, 1.0), oz.clip(-1.0, 1.0), (1 - along) / d**3
 
 
+def back_project(view: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Return the points of depth z along the viewing rays, camera frame; `view` points toward the camera."""
+    return view * (depth / view[:, 2])[:, None]
+
+
 def relative_positions(
     view: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
@@ -59,7 +64,7 @@ def relative_positions(
     """
     if not weight.sum() > 0:
         return np.zeros((len(depth), 3))
-    # back-projection along the viewing ray, centred and divided by the weighted RMS distance
-    place = view * (depth / view[:, 2])[:, None]
+    # centred and divided by the weighted RMS distance
+    place = back_project(view, depth)
     place = place - np.average(place, axis=0, weights=weight)
     return place / max(float(np.sqrt(np.average((place**2).sum(1), weights=weight))), 1e-300)

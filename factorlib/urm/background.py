@@ -7,8 +7,8 @@ plane through f with normal n below the objects, the pixel's ray d meets
     p = d (f · n)/(d · n).                                                                                           (1)
 
 So a photo that looks down on an object shows most of the light that reaches it from below.  Photos are not proofs: a
-backdrop may hide the lamps, and a cut-out has no surroundings at all.  A solve therefore uses a background only if the
-observations of the objects support it (`factorlib.inference.background`).
+backdrop may hide the lamps, and a cut-out has no surroundings at all.  A solve therefore leaves out a
+background that the observations of the objects contradict (`factorlib.inference.model_selection`).
 """
 
 from collections.abc import Mapping
@@ -43,8 +43,8 @@ def surrounding_radiance(
     """
     hidden = (photo["label"] > 0) | (photo["left_out"] > 0)
     radiance = np.stack([photo[c] for c in "RGB"], axis=-1)
-    shown = ~binary_dilation(hidden, iterations=RIM) & np.isfinite(radiance).all(-1)
-    rays = camera.rays()[shown]
+    visible = ~binary_dilation(hidden, iterations=RIM) & np.isfinite(radiance).all(-1)
+    rays = camera.rays()[visible]
     direction = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     if ground is not None:  # (1)
         towards = ground.hit(rays) - centre
@@ -55,9 +55,9 @@ def surrounding_radiance(
     row, column = (np.floor(t * n).astype(int).clip(0, n - 1) for t, n in ((row, ROWS), (column, 2 * ROWS)))
     texel = row * 2 * ROWS + column
     size = 2 * ROWS**2
-    clipped = np.stack([photo[f"clipped.{c}"][shown] for c in "RGB"], axis=1).any(1)
+    clipped = np.stack([photo[f"clipped.{c}"][visible] for c in "RGB"], axis=1).any(1)
     pixels, clipped_pixels = np.bincount(texel, minlength=size), np.bincount(texel, clipped, size)
-    sums = np.stack([np.bincount(texel, values, size) for values in radiance[shown].T], axis=1)
+    sums = np.stack([np.bincount(texel, values, size) for values in radiance[visible].T], axis=1)
     means = sums / np.maximum(pixels, 1)[:, None]
     means[(pixels < LEAST_PIXELS) | (clipped_pixels > MOST_CLIPPED * pixels) | (means <= 0).any(1)] = 0
     return means.reshape(ROWS, 2 * ROWS, 3)

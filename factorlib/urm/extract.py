@@ -15,10 +15,11 @@ from jaxtyping import Bool, Float
 
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr
-from factorlib.light.distance import relative_positions
+from factorlib.light.distance import back_project, relative_positions
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
+LEAST_WEIGHT = 1e-6  # weight of a point whose normal has no confidence, in the centre of all points
 GRAZING = 0.05  # least n·o: beyond 87° neither the normal nor the pixel's footprint is reliable
 
 
@@ -53,11 +54,11 @@ def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float
 def surface_centre(geometry: Channels) -> Float[np.ndarray, "3"]:
     """Return the mean of the visible surface points, weighted by confidence, in the camera's frame; 0 without any."""
     view, depth = np.stack([geometry[f"view.{a}"] for a in "xyz"], axis=-1), geometry["depth"]
-    shown = (depth > 0) & (view[..., 2] < 0)
-    if not shown.any():
+    visible = (depth > 0) & (view[..., 2] < 0)
+    if not visible.any():
         return np.zeros(3)
-    places = view[shown] * (depth[shown] / view[shown][:, 2])[:, None]
-    return np.average(places, axis=0, weights=geometry["confidence"][shown] + 1e-6)
+    points = back_project(view[visible], depth[visible])
+    return np.average(points, axis=0, weights=geometry["confidence"][visible] + LEAST_WEIGHT)
 
 
 def extract_observations(

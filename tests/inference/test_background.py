@@ -10,6 +10,7 @@ from factorlib.inference.background import DEVIATION, Background, condition_on_b
 from factorlib.inference.gauge import has_free_factor
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.options import SolveOptions
+from factorlib.inference.paper_solver import PaperOptions, solve_paper
 from factorlib.inference.start import start_from_photos
 from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import PRIOR, drawn, on_even_cells, photographed
@@ -87,4 +88,10 @@ def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_
 def test_the_factor_of_a_component_is_free_unless_a_background_fixes_it(lit):
     names = [block.name for block in lit.blocks]
     assert not has_free_factor(lit.blocks, names)
-    assert has_free_factor(lit.with_backgrounds([False] * 3).blocks, names)
+    assert has_free_factor(lit.with_backgrounds().blocks, names)
+
+
+def test_the_solver_of_the_paper_ignores_backgrounds_and_keeps_its_gauge(lit):
+    quick = PaperOptions(lobes=4, samplings=0.5)
+    with_them, without = (solve_paper(each, 3, quick) for each in (lit, lit.with_backgrounds()))
+    np.testing.assert_array_equal(with_them.point.materials.rows(), without.point.materials.rows())
