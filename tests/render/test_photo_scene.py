@@ -8,7 +8,7 @@ import trimesh
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
-from factorlib.geometry.ground import Plane, resting_plane
+from factorlib.geometry.ground import Plane, resting_plane, stable_poses
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
@@ -114,6 +114,16 @@ def test_a_box_stands_on_its_largest_side_that_looks_down():
 def test_a_flat_object_rests_nowhere(depth):
     card = np.random.default_rng(0).random((50, 3)) * [1, 1, depth]
     assert resting_plane(card, card, np.eye(3), np.array([[0.0, 1.0, 0.0]])) is None
+
+
+def test_a_cube_rests_on_each_face_alike_and_an_oblique_prism_not_on_its_base():
+    cube = box(1, 1, 1).vertices
+    ups, chances = stable_poses(cube)
+    np.testing.assert_allclose(np.abs(ups).max(axis=1), 1, atol=1e-9)
+    np.testing.assert_allclose(chances, 1 / 6, atol=1e-9)
+    leaning = cube + cube[:, 1:2] * [3, 0, 0]  # its centre is half a side to the right of its base
+    ups, _ = stable_poses(leaning)
+    assert len(ups) and (np.abs(ups[:, 1]) < 0.99).all()
 
 
 AXIS = np.array([0.6, -0.48, -0.64])
