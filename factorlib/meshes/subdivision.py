@@ -16,6 +16,8 @@ from factorlib.meshes.mesh import Mesh, area_vectors, weld_vertices
 
 LONGEST = 0.04  # longest edge after subdivision, in units of the mesh's extent
 LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the gradient's
+MOST_TURN_DEG = 30.0  # largest angle between a face before and after a displacement
+HALVINGS = 12  # largest number of halvings of a node's displacement
 UNSEEN = 0.05  # weight of the gradient where no photo sees the surface
 
 
@@ -155,13 +157,24 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         return spsolve(system.tocsc(), right)
 
     def displace(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
-        """Move the vertices along their nodes' normals, by `displacement` times the extent, and update the normals."""
+        """Move the vertices along their nodes' normals, by `displacement` times the extent, and update the normals.
+
+        Nodes move less where a face would turn by more than `MOST_TURN_DEG`, as narrow faces of rims do.
+        """
         weighted = area_vectors(self.mesh.vertices, self.mesh.faces)
         sums = [np.bincount(self.faces.reshape(-1), np.repeat(weighted[:, a], 3), self.nodes) for a in range(3)]
         # area-weighted normals of the nodes
         outward = np.stack(sums, axis=1)
         outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
-        place = self.mesh.vertices + (displacement[:, None] * self.extent * outward)[self.node]
+        steps = displacement[:, None] * self.extent * outward
+        for _ in range(HALVINGS):
+            place = self.mesh.vertices + steps[self.node]
+            moved = area_vectors(place, self.mesh.faces)
+            lengths = np.linalg.norm(moved, axis=1) * np.linalg.norm(weighted, axis=1)
+            folded = np.sum(moved * weighted, axis=1) < np.cos(np.radians(MOST_TURN_DEG)) * lengths
+            if not folded.any():
+                break
+            steps[np.unique(self.faces[folded])] /= 2
         normal = self.mesh.normals + self.normal_change(displacement)[self.node]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         return msgspec.structs.replace(self.mesh, vertices=place, normals=normal)
