@@ -11,13 +11,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
 
 from factorlib.meshes.mesh import Mesh, area_vectors, weld_vertices
 
 LONGEST = 0.04  # longest edge after subdivision, in units of the mesh's extent
 LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the gradient's
-MOST_TURN_DEG = 30.0  # largest angle between a face before and after a displacement
-HALVINGS = 12  # largest number of halvings of a node's displacement
+THIN = 0.06  # greatest thickness of a thin part, in units of the extent; displacements are a third of it
+OPPOSITE = -0.5  # largest cosine between normals of opposite sides
+MOST_INWARD = 0.45  # largest displacement inward, in units of the thickness
 UNSEEN = 0.05  # weight of the gradient where no photo sees the surface
 
 
@@ -159,25 +161,33 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
     def displace(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
         """Move the vertices along their nodes' normals, by `displacement` times the extent, and update the normals.
 
-        Nodes move less where a face would turn by more than `MOST_TURN_DEG`, as narrow faces of rims do.
+        Nodes of thin parts move inward by less than half of the thickness, so that two sides do not cross.
         """
-        weighted = area_vectors(self.mesh.vertices, self.mesh.faces)
-        sums = [np.bincount(self.faces.reshape(-1), np.repeat(weighted[:, a], 3), self.nodes) for a in range(3)]
+        weighted = np.repeat(area_vectors(self.mesh.vertices, self.mesh.faces), 3, axis=0)
+        sums = [np.bincount(self.faces.reshape(-1), column, self.nodes) for column in weighted.T]
         # area-weighted normals of the nodes
         outward = np.stack(sums, axis=1)
         outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
-        steps = displacement[:, None] * self.extent * outward
-        for _ in range(HALVINGS):
-            place = self.mesh.vertices + steps[self.node]
-            moved = area_vectors(place, self.mesh.faces)
-            lengths = np.linalg.norm(moved, axis=1) * np.linalg.norm(weighted, axis=1)
-            folded = np.sum(moved * weighted, axis=1) < np.cos(np.radians(MOST_TURN_DEG)) * lengths
-            if not folded.any():
-                break
-            steps[np.unique(self.faces[folded])] /= 2
+        step = np.maximum(displacement, -MOST_INWARD * self.thickness(outward)) * self.extent
+        place = self.mesh.vertices + (step[:, None] * outward)[self.node]
         normal = self.mesh.normals + self.normal_change(displacement)[self.node]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         return msgspec.structs.replace(self.mesh, vertices=place, normals=normal)
+
+    def thickness(self, outward: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
+        """Return the distance behind each node of a nearby node on an opposite side, in units of the extent.
+
+        It is infinite where the object is thicker than `THIN`.
+        """
+        place = np.zeros((self.nodes, 3))
+        place[self.node] = self.mesh.vertices / self.extent
+        pairs = cKDTree(place).query_pairs(THIN, output_type="ndarray")
+        pairs = pairs[np.sum(outward[pairs[:, 0]] * outward[pairs[:, 1]], axis=1) < OPPOSITE]
+        result = np.full(self.nodes, np.inf)
+        for i, j in (pairs.T, pairs.T[::-1]):
+            gap = np.sum((place[i] - place[j]) * outward[i], axis=1)
+            np.minimum.at(result, i[gap > 0], gap[gap > 0])
+        return result
 
 
 def subdivided_mesh(mesh: Mesh, longest: float = LONGEST) -> SubdividedMesh:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipped_faces
 from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read_mesh import merged_normals, read_mesh, usable
-from factorlib.meshes.subdivision import MOST_TURN_DEG, SubdividedMesh, subdivide, subdivided_mesh
+from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
 from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals, triangulate
 from tests.faults import sample
 from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put
@@ -322,13 +322,15 @@ def test_a_displacement_is_found_from_the_turns_that_it_means():
     assert np.std(result - result.mean() - true) < 0.05 * np.std(true)
 
 
-def test_no_face_folds_over_however_far_its_nodes_are_to_move():
-    body = subdivided_mesh(ball(3))
-    before = area_vectors(body.mesh.vertices, body.mesh.faces)
-    rough = np.random.default_rng(0).normal(size=body.nodes) * 0.1  # neighbours move apart by more than an edge
-    after = area_vectors(body.displace(rough).vertices, body.mesh.faces)
-    cosine = np.sum(before * after, 1) / np.linalg.norm(before, axis=1) / np.linalg.norm(after, axis=1)
-    assert cosine.min() > np.cos(np.radians(MOST_TURN_DEG)) - 1e-9
+def test_the_two_sides_of_a_thin_disc_do_not_cross():
+    body = subdivided_mesh(ball(4, (1.0, 1.0, 0.03)))
+    inward = body.displace(np.full(body.nodes, -0.02))  # each side by more than the half thickness of 0.015
+    facing = np.abs(body.mesh.normals[:, 2]) > 0.9
+    front = np.sign(body.mesh.normals[facing, 2])
+    before, after = (front * mesh.vertices[facing, 2] for mesh in (body.mesh, inward))
+    assert (after > 0).all() and (after < before).all()
+    outward = body.displace(np.full(body.nodes, 0.02))
+    np.testing.assert_allclose(np.linalg.norm(outward.vertices - body.mesh.vertices, axis=1), 0.02 * body.extent)
 
 
 def test_a_ball_that_was_given_as_an_ellipsoid_gets_its_normals_back():
