@@ -18,7 +18,7 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.fit_runner import Solution
 from factorlib.inference.gauge import DETERMINED, GIVEN, RULE, UP_TO_SCALE, connected_components
 from factorlib.inference.lights import Light
-from factorlib.inference.material_prior import likeliest_class
+from factorlib.inference.material_prior import likeliest_class, material_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, Materials
 from factorlib.inference.misfit import unexplained_shares
 from factorlib.inference.problem import JointProblem
@@ -89,8 +89,9 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         materials = self.solution.point.materials
         errors = self.errors.materials
         relative = errors.specular.mean(1) / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
-        specular = self.solution.materials.point.materials.specular
-        rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
+        fitted = self.solution.materials.point.materials
+        unknowns = material_unknowns(msgspec.structs.replace(fitted, roughness=materials.roughness))
+        rows = zip(unknowns, relative.tolist(), errors.roughness.tolist(), strict=True)
         classes = self.problem.known.classes
         return [table.Kind(*likeliest_class(*row, classes.get(m))) for m, row in enumerate(rows)]
 

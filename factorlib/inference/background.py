@@ -26,6 +26,9 @@ from factorlib.light.lobes import lobe_energy
 
 DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is observed whole
 SHARPEST = 350.0  # largest λ of a kernel, about as wide as a texel
+# Least share of the sphere that a photo shows.  A long lens shows little but what is straight behind the objects: the
+# black cloth of a studio, or a sky.  That says nothing of the light, and yet it would fix the scale of reflectances.
+LEAST_COVERAGE = 0.05
 LEAST_RADIANCE = 1e-3  # least radiance of a cell, in units of the block
 
 
@@ -68,9 +71,11 @@ class Background(msgspec.Struct, frozen=True):
 
 
 def concatenate_backgrounds(backgrounds: list[Background]) -> Background | None:
-    """Return the background of several photos; None without any direction."""
-    fields = (np.concatenate([getattr(b, name) for b in backgrounds]) for name in Background.__struct_fields__)
-    return Background(*fields) if any(len(b.direction) for b in backgrounds) else None
+    """Return the background of several photos, without those that show less than LEAST_COVERAGE; None without any."""
+    wide = [background for background in backgrounds if background.solid_angle.sum() > LEAST_COVERAGE * 4 * np.pi]
+    if not wide:
+        return None
+    return Background(*(np.concatenate([getattr(each, name) for each in wide]) for name in Background.__struct_fields__))
 
 
 def condition_on_background(

@@ -5,7 +5,7 @@ prior: stone becomes enamel.  Once the errors of the model are known (`factorlib
 is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, S its covariance by the observations alone, and
 M that of the errors of the model.  p is the mixture of classes of `factorlib.inference.material_prior`.  θ minimises
 
-    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + S g                                     (1)
+    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(θ),    θ₀ = θ̂ + S g                                     (1)
 
 with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior, and θ₀ is the estimate of the observations
 without it.  So without errors of the model (M = 0) θ̂ stays.  S couples k_d to k_s, so k_d follows.  The covariance is
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from factorlib.inference.material_prior import Mixture, classes_of
+from factorlib.inference.material_prior import TINTS, Mixture, classes_of
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 
 BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
@@ -74,20 +74,22 @@ def material_posterior(
         full = fitted.copy()
         full[free] = unknowns
         off = unknowns - center[free]
-        energy, slope, _, _ = mixture.evaluate(full[3:])
-        return float(off @ precision @ off) + energy, 2 * (precision @ off + np.append(np.zeros(3), slope)[free])
+        energy, slope, _, _ = mixture.evaluate(full)
+        return float(off @ precision @ off) + energy, 2 * (precision @ off + slope[free])
 
-    # (1) has several minima: one start is the fit, the others have the means of the classes
-    starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean)]
+    # (1) has several minima: one start is the fit, the others have the means of the classes and one tint or none
+    tint, grey = TINTS @ fitted[:3], np.full(3, fitted[:3].mean())
+    starts = [fitted]
+    for mean in mixture.mean:
+        starts += [np.append(fitted[:3], mean), np.append(grey, mean), np.append(fitted[:3], mean + np.append(tint, 0.0))]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x
-    by_prior = np.zeros((7, 7))
-    by_prior[3:, 3:] = mixture.evaluate(result[3:])[2]
+    by_prior = mixture.evaluate(result)[2]
     variance = np.zeros(7)
     variance[free] = np.diag(np.linalg.inv(precision + by_prior[np.ix_(free, free)]))
     share = np.where(free, 1 - variance / np.diag(limited), 0.0).clip(0, 1)
-    # no prior bears on k_d, whose deviation is therefore not limited
+    # the prior says little of k_d, whose deviation is therefore not limited
     posterior_deviation = np.where(np.arange(7) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))
     return MaterialPosterior(result, posterior_deviation, share)
 
@@ -98,5 +100,5 @@ def without_prior(
     """Return S with limited deviations, and θ₀ of (1)."""
     scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(np.sqrt(np.diag(covariance)), LEAST_DEVIATION))
     limited = covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)
-    slope = np.where(free, np.append(np.zeros(3), mixture.evaluate(fitted[3:])[1]), 0.0)
+    slope = np.where(free, mixture.evaluate(fitted)[1], 0.0)
     return limited, fitted + np.where(free, limited @ slope, 0.0)

@@ -1,21 +1,24 @@
-"""Prior on materials: a mixture of dielectrics, metals and fabrics for k_s and roughness, and ordinary brightness.
+"""Prior on materials: a mixture of dielectrics, metals and fabrics, and ordinary brightness.
 
-A material is dielectric, metal or fabric, with shares π_c.  Let l = log k_s of its three channels, l̄ their mean and x
-= (l̄, roughness):
+A material is dielectric, metal or fabric, with shares π_c.  Let l = log k_s of its three channels, l̄ their mean, x =
+(l̄, roughness), and e the tint of k_s less that of k_d + k_s, where the tint of k is log k less its mean:
 
-    p(l, roughness) = Σ_c π_c N(x; μ_c, S_c) Π N(l − l̄; 0, τ_c²)                                                   (1)
+    p(l, roughness | k_d) ∝ Σ_c π_c N(x; μ_c, S_c) N(l − l̄; 0, τ_c²) exp(−|e|²/2ε_c²).                              (1)
 
-The last factor is over the two dimensions of l − l̄.  μ_c, S_c and τ_c are those of measured materials
-(`studies.measured.material_classes`, material_classes.json).  S_c and τ_c are widened by the unknown scale of
-reflectances and the unknown white balance of photos (`SCALE_DEVIATION`, `CLASS_ROUGHNESS_DEVIATION`,
-`WHITE_DEVIATION`).  Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, 0.02 to 0.08, equally in all
-colours.  Metals reflect more, with a tint.  Fabrics scatter within, and GGX shows this as a strong and very rough part.
-A smooth surface with k_s = 0.3 is therefore metal, and a k_s of 0.2 at roughness 1 is fabric; neither is inferred
-without evidence.  Where the user names a material's class, that one alone has a share.
+Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, 0.02 to 0.08, equally in all colours.  Metals reflect
+more, with a tint.  Fabrics scatter within, and GGX shows this as a strong and very rough part.  Both parts of metals
+and fabrics have one tint (ε); without ε, orange wood of a blue specular part would be a fabric.  N(l − l̄) is over two
+dimensions.  (1) is a density where k_d is 0; elsewhere ε makes metals and fabrics less likely than π.  A smooth surface with k_s = 0.3 is therefore metal, and a k_s of
+0.2 at roughness 1 is fabric; neither is inferred without evidence.  Where the user names a material's class, that one
+alone has a share.
 
-Let r_c be the share of class c in the sum (1).  Half the gradient of −2 log p is Σ_c r_c P_c (x − μ_c), P_c the class's
-precision.  Half the Hessian is approximated by Σ_c r_c P_c, the Hessian of the bound of expectation maximisation, which
-is positive definite.
+μ_c, S_c, τ_c and ε_c are those of measured materials (`studies.measured.material_classes`, material_classes.json).
+They are widened by the unknown scale of reflectances and the unknown white balance of photos (`SCALE_DEVIATION`,
+`CLASS_ROUGHNESS_DEVIATION`, `WHITE_DEVIATION`).
+
+Let r_c be the share of class c in the sum (1).  Half the gradient of −2 log p is the mean of the classes' under r_c.
+Half the Hessian is approximated by the mean of their precisions, JᵀJ/ε_c² for e, the Hessian of the bound of
+expectation maximisation, which is positive definite.
 
 A factor per channel is free between the materials and the lights of a connected component, unless surfaces light each
 other.  Then it is known only as well as the model of interreflection holds.  So the brightest material of a component
@@ -64,7 +67,7 @@ TINTS = np.eye(3) - 1 / 3
 
 
 class MaterialClass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Class of measured materials: π, μ, S and τ of (1).
+    """Class of measured materials: π, μ, S, τ and ε of (1).
 
     Attributes:
         name: Name of the class.
@@ -72,6 +75,7 @@ class MaterialClass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         mean: μ of the mean log k_s and of roughness.
         covariance: S of the same.
         tint: τ.
+        tint_difference: ε; None if both parts may have any tints.
     """
 
     name: str
@@ -79,6 +83,7 @@ class MaterialClass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mean: tuple[float, float]
     covariance: tuple[tuple[float, float], tuple[float, float]]
     tint: float
+    tint_difference: float | None = None
 
 
 class Classes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -116,7 +121,7 @@ class Mixture:
 
     Args:
         classes: The classes.
-        relative: Standard deviation that is added to that of l, in quadrature.
+        relative: Standard deviation that is added to those of logarithms, in quadrature.
         rough: Standard deviation that is added to that of roughness, in quadrature.
     """
 
@@ -126,10 +131,14 @@ class Mixture:
         self.names = [material_class.name for material_class in classes]
         slack = np.diag([SCALE_DEVIATION**2 + relative**2, rough**2])
         covariances = [np.array(material_class.covariance) + slack for material_class in classes]
-        tints = np.array([material_class.tint**2 + WHITE_DEVIATION**2 + relative**2 for material_class in classes])
         self.mean = np.array([[material_class.mean[0]] * 3 + [material_class.mean[1]] for material_class in classes])
         self.precision = np.zeros((len(classes), 4, 4))
-        # precision of (log k_s, roughness), [4, 4] a class
+        # τ², and 1/ε² of each class
+        noise = WHITE_DEVIATION**2 + relative**2
+        tints = np.array([material_class.tint**2 + noise for material_class in classes])
+        differences = [material_class.tint_difference for material_class in classes]
+        self.difference = np.array([0.0 if each is None else 1 / (each**2 + noise) for each in differences])
+        # precision of (log k_s, roughness), [4, 4] a class, but for e
         for P, covariance, variance in zip(self.precision, covariances, tints, strict=True):
             inverse = np.linalg.inv(covariance)
             P[:3, :3] = MEAN * inverse[0, 0] / 3 + TINTS / variance  # l̄ = Σ l/3
@@ -140,20 +149,32 @@ class Mixture:
         self.constant = determinants + 2 * np.log(tints) - 2 * np.log(shares)
 
     def evaluate(
-        self, x: Float[np.ndarray, "4"]
-    ) -> tuple[float, Float[np.ndarray, "4"], Float[np.ndarray, "4 4"], Float[np.ndarray, " c"]]:
+        self, theta: Float[np.ndarray, "7"]
+    ) -> tuple[float, Float[np.ndarray, "7"], Float[np.ndarray, "7 7"], Float[np.ndarray, " c"]]:
         """Return −2 log p, half its gradient, half its Hessian and the class probabilities.
 
-        x is (log k_s, roughness), with log k_s of three channels.
+        theta is (log k_d, log k_s, roughness), with logarithms of three channels.
         """
-        off = x - self.mean
+        off = theta[3:] - self.mean
         slope = np.einsum("cij,cj->ci", self.precision, off)
         energy = (off * slope).sum(1) + self.constant
+        # e and its Jacobian by log k_d and log k_s
+        share = 1 / (1 + np.exp(theta[3:6] - theta[:3]))  # k_d/(k_d + k_s)
+        e = -TINTS @ np.logaddexp(0, theta[:3] - theta[3:6])
+        J = TINTS * share @ np.hstack([-np.eye(3), np.eye(3)])
+        energy = energy + self.difference * (e @ e)
         least = energy.min()
         odds = np.exp(-(energy - least) / 2)
         probability = odds / odds.sum()
         value = float(least - 2 * np.log(odds.sum()))
-        return value, probability @ slope, np.einsum("c,cij->ij", probability, self.precision), probability
+        # means over the classes
+        difference = probability @ self.difference
+        gradient, hessian = np.zeros(7), np.zeros((7, 7))
+        gradient[3:] = probability @ slope
+        gradient[:6] += difference * (J.T @ e)
+        hessian[3:, 3:] = np.einsum("c,cij->ij", probability, self.precision)
+        hessian[:6, :6] += difference * (J.T @ J)
+        return value, gradient, hessian, probability
 
 
 class PriorTerms(NamedTuple):
@@ -190,10 +211,10 @@ class MaterialPrior:
         gradient = off * self.wide
         hessians = np.tile(np.diag(self.wide), (len(theta), 1, 1))
         for m in self.specular:
-            energy, slope, curvature, _ = self.mixtures[m].evaluate(theta[m, 3:])
+            energy, slope, curvature, _ = self.mixtures[m].evaluate(theta[m])
             value = value + energy
-            gradient[m, 3:] = gradient[m, 3:] + slope
-            hessians[m, 3:, 3:] += curvature
+            gradient[m] = gradient[m] + slope
+            hessians[m] += curvature
         gradient = gradient.reshape(-1)
         hessian = block_diag(*hessians)
         # (2) of each component's brightest material
@@ -211,22 +232,20 @@ class MaterialPrior:
 
 
 def likeliest_class(
-    specular: Float[np.ndarray, "3"], roughness: float, relative: float, rough: float, name: str | None = None
+    theta: Float[np.ndarray, "7"], relative: float, rough: float, name: str | None = None
 ) -> tuple[str, float]:
     """Return the likeliest class of a material and its probability.
 
     Classes are widened by the standard errors; in a fit they are widened by `CLASS_ROUGHNESS_DEVIATION`.
 
     Args:
-        specular: k_s.
-        roughness: Roughness.
+        theta: Unknowns of the material (`material_unknowns`).
         relative: Standard error of log k_s.
         rough: Standard error of roughness.
         name: Class that the user named.
     """
     mixture = Mixture(classes_of(name), relative, rough)
-    x = np.append(np.log(np.maximum(specular, LEAST_REFLECTANCE)), roughness)
-    probability = mixture.evaluate(x)[3]
+    probability = mixture.evaluate(theta)[3]
     best = int(probability.argmax())
     return mixture.names[best], float(probability[best])
 

@@ -130,7 +130,7 @@ def _with_background(block: Block, maps: Maps, rotations: Rotations) -> Block:
         for photo in block.photos
         if photo in maps
     ]
-    return msgspec.structs.replace(block, background=concatenate_backgrounds(backgrounds) if backgrounds else None)
+    return msgspec.structs.replace(block, background=concatenate_backgrounds(backgrounds))
 
 
 def usable_observations(observations: Observations) -> Observations:

@@ -3,8 +3,8 @@
 `python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]` takes a second.
 
 FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and
-`roughness`, and `k_s_r`, `k_s_g` and `k_s_b`, whose ratios are the tint.  The class of a row is that whose words its
-name has: METALS, FIBROUS, or else dielectric.
+`roughness`, and `k_s_r`, `k_s_g`, `k_s_b`, `k_d_r`, `k_d_g` and `k_d_b`, whose ratios are the tints.  The class of a row
+is that whose words its name has: METALS, FIBROUS, or else dielectric.
 """
 
 import csv
@@ -34,7 +34,7 @@ FIBROUS = (
 )
 LEAST = 1e-3  # of k_s: what a fit calls nil
 RAYLEIGH = np.sqrt(2 * np.log(2))  # the median length of a Gaussian vector of two dimensions, in standard deviations
-COLUMNS = ("material", "k_s_r", "k_s_g", "k_s_b", "k_s", "roughness")
+COLUMNS = ("material", "k_s_r", "k_s_g", "k_s_b", "k_s", "roughness", "k_d_r", "k_d_g", "k_d_b")
 
 
 def classes_of(path: Path) -> Classes:
@@ -62,13 +62,25 @@ def classes_of(path: Path) -> Classes:
 
 
 def _fit_class(name: str, values: np.ndarray, total: int) -> MaterialClass:
-    log = np.log(np.maximum(values[:, :3], LEAST))
-    tint = np.median(np.linalg.norm(log - log.mean(1, keepdims=True), axis=1)) / RAYLEIGH
+    specular, diffuse = values[:, :3], values[:, 5:]
+    tint = _tints(specular)
+    difference = None if name == "dielectric" else _deviation(tint - _tints(specular + diffuse))
     x = np.column_stack([np.log(np.maximum(values[:, 3], LEAST)), values[:, 4]])
     mean = np.round(x.mean(0), 3).tolist()
     covariance = np.round(np.cov(x.T), 4).tolist()
     share = round(len(values) / total, 3)
-    return MaterialClass(name, share, tuple(mean), tuple(map(tuple, covariance)), round(float(tint), 3))
+    return MaterialClass(name, share, tuple(mean), tuple(map(tuple, covariance)), _deviation(tint), difference)
+
+
+def _tints(reflectance: np.ndarray) -> np.ndarray:
+    """Return the logarithm of each row less its mean."""
+    log = np.log(np.maximum(reflectance, LEAST))
+    return log - log.mean(1, keepdims=True)
+
+
+def _deviation(tints: np.ndarray) -> float:
+    """Return the standard deviation of tints by their median length."""
+    return round(float(np.median(np.linalg.norm(tints, axis=1)) / RAYLEIGH), 3)
 
 
 def main(file: Path, out: Annotated[Path | None, typer.Option(help="File to write to.")] = None) -> None:

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.inference.background import DEVIATION, Background, condition_on_background
+from factorlib.inference.background import DEVIATION, Background, concatenate_backgrounds, condition_on_background
 from factorlib.inference.gauge import has_free_factor
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.options import SolveOptions
@@ -57,6 +57,14 @@ def test_a_background_turns_with_the_camera_of_a_light_that_is_fixed_to_the_worl
     np.testing.assert_allclose(turned.direction, still.direction @ turn.T)
 
 
+def test_a_narrow_view_is_no_background():
+    """Of a telephoto lens, straight behind the objects; beside a wide one it says nothing either."""
+    wide = lower_half(on_even_cells(drawn(3, 80)))
+    narrow = Background(wide.direction[:20], 0.01 * wide.radiance[:20], wide.solid_angle[:20])
+    assert concatenate_backgrounds([narrow]) is None and concatenate_backgrounds([]) is None
+    np.testing.assert_array_equal(concatenate_backgrounds([narrow, wide]).radiance, wide.radiance)
+
+
 @pytest.fixture(scope="module")
 def lit():
     """Spheres in three lights, and the lights in the units of their blocks."""
@@ -75,14 +83,15 @@ def log_scale(solution) -> float:
 def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_left_out(lit):
     solution = solve(lit, start_from_photos(3), QUICK)
     assert [each.accepted for each in solution.backgrounds] == [True] * 3
-    assert log_scale(solution) < 0.2
+    error = log_scale(solution)
+    assert error < 0.2
     black = msgspec.structs.replace(lit.blocks[1].background, radiance=lit.blocks[1].background.radiance * 2e-3)
     blocks = [lit.blocks[0], msgspec.structs.replace(lit.blocks[1], background=black), lit.blocks[2]]
     solution = solve(lit.with_blocks(blocks), start_from_photos(3), QUICK)
     assert [each.accepted for each in solution.backgrounds] == [True, False, True]
     assert log_scale(solution) < 0.2
     off = solve(lit, start_from_photos(3), msgspec.structs.replace(QUICK, background="off"))
-    assert not any(each.accepted for each in off.backgrounds) and log_scale(off) > 0.3
+    assert not any(each.accepted for each in off.backgrounds) and log_scale(off) > error + 0.1
 
 
 def test_the_factor_of_a_component_is_free_unless_a_background_fixes_it(lit):

@@ -294,19 +294,31 @@ def test_the_gradient_is_the_finite_difference_of_the_value(seed):
 
 
 def test_the_density_is_one_altogether():
-    """Over the level of k_s, its tint and the roughness: the sum on a grid."""
+    """Over the level of k_s, its tint and the roughness, where k_d is 0: the sum on a grid."""
     level, roughness, tint = np.arange(-9, 4, 0.8), np.arange(-2.5, 4, 0.3), np.arange(-1.6, 1.61, 0.2)
     mixture, across = Mixture(shipped_classes().classes), np.array([[1, -1, 0], [1, 1, -2]]) / np.sqrt([[2], [6]])
     grid = np.array(np.meshgrid(level, tint, tint, roughness)).reshape(4, -1).T
-    points = np.column_stack([grid[:, :1] + grid[:, 1:3] @ across, grid[:, 3]])
+    black = np.full((len(grid), 3), -30.0)
+    points = np.column_stack([black, grid[:, :1] + grid[:, 1:3] @ across, grid[:, 3]])
     total = sum(np.exp(-mixture.evaluate(point)[0] / 2) for point in points)
     assert total * 0.8 * 0.3 * 0.2**2 / (2 * np.pi) ** 2 == pytest.approx(1, rel=0.02)
 
 
 @pytest.mark.parametrize("material, name", [(PLASTIC, "dielectric"), (GOLD, "metal"), (FELT, "fabric")])
 def test_materials_are_of_the_class_that_they_look_like(material, name):
-    result, probability = likeliest_class(np.array(material[0]), material[1], 0.05, 0.02)
+    theta = np.log([0.01] * 3 + material[0])
+    result, probability = likeliest_class(np.append(theta, material[1]), 0.05, 0.02)
     assert result == name and probability > 0.8
+
+
+def test_a_rough_specular_part_of_the_complementary_tint_is_no_fabric():
+    """Measured fabrics have one tint in both parts; a set's orange wood once got a blue specular part."""
+    mixture = Mixture(shipped_classes().classes)
+
+    def cost(specular):
+        return mixture.evaluate(np.array([*np.log([0.4, 0.2, 0.1]), *np.log(specular), 0.8]))[0]
+
+    assert cost([0.3, 0.15, 0.075]) + 40 < cost([0.075, 0.15, 0.3])
 
 
 def test_gloss_ten_times_too_strong_at_roughness_1_is_not_expected():

@@ -84,7 +84,7 @@ def test_classes_are_fitted_to_a_table(tmp_path):
         for name, level, roughness in (("plastic", 0.03, 0.3), ("steel", 0.1, 0.2), ("felt", 0.2, 0.8)):
             for k in range(5):
                 factor = np.exp(0.1 * rng.normal())
-                rows.writerow([f"{name}-{k}", *[level * factor] * 4, roughness + 0.01 * k])
+                rows.writerow([f"{name}-{k}", *[level * factor] * 4, roughness + 0.01 * k, *[0.1] * 3])
     material_classes.main(file, out)
     classes = msgspec.convert(read_json(out), Classes)
     assert classes == material_classes.classes_of(file) and classes.made_from == "measured.csv"
