@@ -75,7 +75,9 @@ def concatenate_backgrounds(backgrounds: list[Background]) -> Background | None:
     wide = [background for background in backgrounds if background.solid_angle.sum() > LEAST_COVERAGE * 4 * np.pi]
     if not wide:
         return None
-    return Background(*(np.concatenate([getattr(each, name) for each in wide]) for name in Background.__struct_fields__))
+    return Background(
+        *(np.concatenate([getattr(each, name) for each in wide]) for name in Background.__struct_fields__)
+    )
 
 
 def condition_on_background(

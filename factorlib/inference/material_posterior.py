@@ -81,7 +81,11 @@ def material_posterior(
     tint, grey = TINTS @ fitted[:3], np.full(3, fitted[:3].mean())
     starts = [fitted]
     for mean in mixture.mean:
-        starts += [np.append(fitted[:3], mean), np.append(grey, mean), np.append(fitted[:3], mean + np.append(tint, 0.0))]
+        starts += [
+            np.append(fitted[:3], mean),
+            np.append(grey, mean),
+            np.append(fitted[:3], mean + np.append(tint, 0.0)),
+        ]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_closing
+from scipy.sparse import csr_array, eye_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -48,12 +49,10 @@ class PointEffects(msgspec.Struct, frozen=True):
     Attributes:
         visibility: visibility of the directions of `fibonacci_sphere(k)`, 0 hidden to 255 visible; None is all visible
         place: position relative to the middle, as `factorlib.light.distance` takes it; None is the middle
-        detail: factor on the diffuse reflectance, per channel; None is 1
     """
 
     visibility: UInt8[np.ndarray, "n k"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
-    detail: Float[np.ndarray, "n 3"] | None = None
 
 
 class Reflector:
@@ -97,7 +96,7 @@ class Reflector:
             normals: unit normals
             views: unit directions toward the viewer
             report: receives the number of points done and their total
-            effects: visibility, position and detail of the points
+            effects: visibility and position of the points
         """
         result = np.zeros((2, len(normals), 3))
         step = max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
@@ -121,7 +120,6 @@ class Reflector:
         views: Float[Tensor, "n 3"],
         visibility: Float[Tensor, "n k"] | None,
         place: Float[Tensor, "n 3"] | None,
-        detail: Float[Tensor, "n 3"] | None,
     ) -> Float[Tensor, "2 n 3"]:
         parts = material.diffuse, material.specular, material.roughness
         kd, ks, roughness = (torch.tensor(part, dtype=self.operator.dtype) for part in parts)
@@ -142,8 +140,6 @@ class Reflector:
             shares = [larger * share for share in shares]
         # diffuse and specular part, summed over lobes
         diffuse = kd * ((shares[0] * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
-        if detail is not None:
-            diffuse = diffuse * detail
         specular = torch.zeros_like(diffuse)
         if bool(ks.any()):
             responses = self.operator.specular(roughness, self.sharpness, no, nz, oz)
@@ -152,6 +148,10 @@ class Reflector:
 
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
+# Spacing of the pixels that are evaluated on smooth surfaces, and the largest differences of normals there, in α.
+GRID = 3
+SPREAD = 0.5
+ERROR = 0.1
 STEP = 0.55  # spacing of nodes on a ball, in α
 LONGEST_STEP = 0.1  # largest spacing of nodes, radians
 NARROW = 1000.0  # sharpness above which a spline does not follow a lobe's highlight
@@ -238,19 +238,71 @@ def resynthesise_parts(
     for k, material in enumerate(materials, start=1):
         pixels = label == k
         normals, views = (_unit(vectors[pixels].astype(float)) for vectors in (normal, view))
-        detail = np.ones((len(normals), 3))
-        if "detail.R" in geometry:
-            detail = np.stack([geometry[f"detail.{channel}"][pixels] for channel in "RGB"], axis=-1).astype(float)
-        visibility, bounced, place = nearest_surroundings(surroundings, k - 1, *np.nonzero(pixels))
-        radiance = reflector.parts(material, normals, views, report_pixels, PointEffects(visibility, place, detail))
+        y, x = np.nonzero(pixels)
+        visibility, bounced, place = nearest_surroundings(surroundings, k - 1, y, x)
+        # the operator at some pixels, interpolation elsewhere
+        nodes, weights = interpolation_nodes(pixels, normals, views, material.roughness**2)
+        effects = PointEffects(*(None if values is None else values[nodes] for values in (visibility, place)))
+        at_nodes = reflector.parts(material, normals[nodes], views[nodes], report_pixels, effects)
+        radiance = np.stack([weights @ part for part in at_nodes])
         # radiance of bounces: k_d G_d + k_s G_s
         if bounced is not None:
             facing = np.sum(normals * views, 1, keepdims=True) > 0
-            radiance[0] += np.array(material.diffuse) * detail * bounced[:, :3] * facing
+            radiance[0] += np.array(material.diffuse) * bounced[:, :3] * facing
             radiance[1] += np.array(material.specular) * bounced[:, 3:] * facing
+        if "detail.R" in geometry:
+            radiance[0] *= np.stack([geometry[f"detail.{channel}"][pixels] for channel in "RGB"], axis=-1)
         pictures[:, pixels] = radiance
         before += int(pixels.sum())
+        report_pixels(0, 0)
     return pictures
+
+
+def interpolation_nodes(
+    pixels: Bool[np.ndarray, "h w"], normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], alpha: float
+) -> tuple[Int[np.ndarray, " m"], csr_array]:
+    """Select the pixels that the operator is evaluated at, and the weights that interpolate the others.
+
+    The nodes of a grid of GRID pixels are evaluated.  A pixel between them is interpolated bilinearly if it lies among
+    four nodes of the mask, whose normals differ by less than SPREAD α, and its normal is by less than ERROR α that of
+    the interpolation: a highlight, of width α, is smooth there.  All other pixels are evaluated.
+
+    Args:
+        pixels: mask of n pixels
+        normals: unit normals
+        views: unit directions toward the viewer
+        alpha: α of the material
+
+    Returns:
+        Numbers of the evaluated pixels, and weights [n, m] of their values.
+    """
+    y, x = np.nonzero(pixels)
+    number = np.full((pixels.shape[0] + GRID, pixels.shape[1] + GRID), -1)
+    number[y, x] = np.arange(len(y))
+    # numbers and weights of the four nodes about each pixel
+    top, left = y - y % GRID, x - x % GRID
+    down, right = y % GRID / GRID, x % GRID / GRID
+    corners = np.stack([number[top + i, left + j] for i in (0, GRID) for j in (0, GRID)], axis=1)
+    shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=1)
+    rows = np.flatnonzero((corners >= 0).all(1))
+    if not len(rows):
+        return np.arange(len(y)), eye_array(len(y), format="csr")
+    at_corners = normals[corners[rows]]
+    spread = np.linalg.norm(at_corners - at_corners[:, :1], axis=-1).max(1)
+    error = np.linalg.norm(_unit(np.einsum("nk,nkc->nc", shares[rows], at_corners)) - normals[rows], axis=-1)
+    facing = np.einsum("nkc,nc->nk", at_corners, views[rows]).min(1) > 0
+    smooth = rows[(spread < SPREAD * alpha) & (error < ERROR * alpha) & facing]
+    # grid nodes have a weight of 1 at themselves
+    evaluated = np.ones(len(y), bool)
+    evaluated[smooth] = (y[smooth] % GRID == 0) & (x[smooth] % GRID == 0)
+    nodes = np.flatnonzero(evaluated)
+    column = np.zeros(len(y), int)
+    column[nodes] = np.arange(len(nodes))
+    between = smooth[~evaluated[smooth]]
+    values = np.concatenate([np.ones(len(nodes)), shares[between].reshape(-1)])
+    row = np.concatenate([nodes, np.repeat(between, 4)])
+    columns = np.concatenate([column[nodes], column[corners[between]].reshape(-1)])
+    return nodes, csr_array((values, (row, columns)), (len(y), len(nodes)))
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

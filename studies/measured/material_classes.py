@@ -3,8 +3,8 @@
 `python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]` takes a second.
 
 FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and
-`roughness`, and `k_s_r`, `k_s_g`, `k_s_b`, `k_d_r`, `k_d_g` and `k_d_b`, whose ratios are the tints.  The class of a row
-is that whose words its name has: METALS, FIBROUS, or else dielectric.
+`roughness`, and `k_s_r`, `k_s_g`, `k_s_b`, `k_d_r`, `k_d_g` and `k_d_b`, whose ratios are the tints.  The class of a
+row is that whose words its name has: METALS, FIBROUS, or else dielectric.
 """
 
 import csv

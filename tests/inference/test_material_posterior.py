@@ -58,7 +58,9 @@ def test_without_errors_of_the_model_a_fit_under_the_prior_stays(seed):
 
 def test_where_the_model_is_wrong_the_material_is_a_likely_one():
     posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [0.01] * 4), np.array([0] * 3 + [30.0] * 4), ALL)
-    modes = [minimize(lambda x: CLASSES.evaluate(np.append(ENAMEL[:3], x))[0], mean, tol=1e-10).fun for mean in CLASSES.mean]
+    modes = [
+        minimize(lambda x: CLASSES.evaluate(np.append(ENAMEL[:3], x))[0], mean, tol=1e-10).fun for mean in CLASSES.mean
+    ]
     assert CLASSES.evaluate(posterior.theta)[0] == pytest.approx(min(modes), abs=1.0)
     assert (posterior.prior_share[3:] > 0.8).all() and (posterior.prior_share[:3] < 0.01).all()
     np.testing.assert_allclose(posterior.theta[:3], ENAMEL[:3], atol=0.02)

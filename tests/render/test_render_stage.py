@@ -15,7 +15,8 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
-from factorlib.render.resynthesis import PointEffects, Reflector, render_balls
+from factorlib.render import resynthesis
+from factorlib.render.resynthesis import PointEffects, Reflector, interpolation_nodes, render_balls, resynthesise
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import silent
@@ -198,6 +199,58 @@ def test_chunks_do_not_show(monkeypatch):
     assert reports[0] == (7, 50) and reports[-1] == (50, 50)
 
 
+def ball_maps(size: int) -> tuple[dict, dict]:
+    """Channels of a photo of a ball, from the front, and of its geometry."""
+    normals, inside = ball_normals(size)
+    normal, view = np.zeros((2, size, size, 3))
+    normal[inside], view[inside] = normals * (1, -1, -1), FRONT
+    geometry = {
+        f"{kind}.{a}": v[..., k] for kind, v in (("normal", normal), ("view", view)) for k, a in enumerate("xyz")
+    }
+    return {"label": inside.astype(float)}, geometry
+
+
+@pytest.mark.parametrize("roughness, share", [(0.15, 1.0), (0.3, 0.4), (0.6, 0.2)])
+def test_interpolated_pixels_are_those_that_the_operator_gives(roughness, share, monkeypatch):
+    """Of a large ball, of which only a share is evaluated: the rim, and more with narrower highlights."""
+    photo, geometry = ball_maps(400)
+    reflector, material = (
+        Reflector(reflection_operator("network"), cells(60.0)),
+        msgspec.structs.replace(GLOSSY, roughness=roughness),
+    )
+    evaluated = []
+    parts = reflector.parts
+    monkeypatch.setattr(reflector, "parts", lambda m, n, *rest: evaluated.append(len(n)) or parts(m, n, *rest))
+    fast = resynthesise(reflector, [material], photo, geometry)
+    monkeypatch.setattr(resynthesis, "SPREAD", 0.0)
+    exact = resynthesise(reflector, [material], photo, geometry)
+    assert evaluated[1] == photo["label"].sum() >= evaluated[0] / share
+    assert np.sqrt(np.mean((fast - exact) ** 2)) < 0.005 * np.sqrt(np.mean(exact**2))
+
+
+def test_detail_is_a_factor_on_the_diffuse_part_alone():
+    photo, geometry = ball_maps(40)
+    detail = np.random.default_rng(4).uniform(0.2, 2.0, (40, 40, 3))
+    painted = geometry | {f"detail.{c}": detail[..., k] for k, c in enumerate("RGB")}
+    reflector = Reflector(reflection_operator("network"), light())
+    plain, result = (resynthesis.resynthesise_parts(reflector, [GLOSSY], photo, each) for each in (geometry, painted))
+    np.testing.assert_allclose(result, plain * [detail, np.ones_like(detail)], rtol=1e-9)
+
+
+def test_nothing_is_interpolated_across_an_edge_nor_over_rough_normals():
+    """Of two planes, and of random normals."""
+    pixels = np.ones((30, 30), bool)
+    bent = np.where(np.arange(900)[:, None] % 30 < 14, unit(1, 0), unit(1, 1))
+    bent *= np.sign(bent @ FRONT)[:, None]
+    views = np.tile(FRONT, (900, 1))
+    nodes, weights = interpolation_nodes(pixels, bent, views, 0.1)
+    assert 100 <= len(nodes) < 350
+    np.testing.assert_allclose(weights @ bent[nodes], bent, atol=1e-12)
+    rough = unit(900, 2)
+    nodes, weights = interpolation_nodes(pixels, rough, rough, 0.1)
+    assert len(nodes) == 900 and (weights @ rough == rough).all()
+
+
 @pytest.mark.parametrize("lit, facing", [(no_lobes(), 1), (light().scale(0.0), 1), (light(), -1)])
 def test_darkness_is_black_and_so_is_what_faces_away(lit, facing):
     normals, views = points(20)
@@ -224,17 +277,3 @@ def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():
     middle = Reflector(operator, lobes, curvature)(GLOSSY, normals, views, effects=PointEffects(place=0 * place))
     np.testing.assert_allclose(middle, Reflector(operator, lobes)(GLOSSY, normals, views), rtol=1e-9)
     assert np.abs(near / middle - 1).max() > 0.1
-
-
-def test_detail_is_a_factor_on_the_diffuse_part_alone():
-    reflector, (normals, views) = Reflector(reflection_operator("network"), light()), points(40)
-    detail, black = np.linspace(0.2, 2.0, 120).reshape(40, 3), (0.0, 0.0, 0.0)
-    diffuse, specular = (Reflectance(kd, ks, 0.4) for kd, ks in ((GLOSSY.diffuse, black), (black, GLOSSY.specular)))
-    parts = [reflector(of, normals, views) for of in (diffuse, specular)]
-    expected = detail * parts[0] + parts[1]
-    np.testing.assert_allclose(
-        reflector(GLOSSY, normals, views, effects=PointEffects(detail=detail)), expected, rtol=0.03, atol=1e-3
-    )
-    np.testing.assert_allclose(
-        reflector(diffuse, normals, views, effects=PointEffects(detail=detail)), detail * parts[0], rtol=1e-5
-    )

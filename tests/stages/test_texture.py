@@ -14,7 +14,7 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
-from factorlib.render.resynthesis import PointEffects, Reflector
+from factorlib.render.resynthesis import Reflector
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.texture_table import TextureTable, read_table, read_textures
@@ -51,12 +51,11 @@ def photographed(folder: Path, paint) -> Inputs:
         y, x = np.nonzero(maps.label > 0)
         point = CAMERA.rays_through(np.column_stack([x, y]) + 0.5)
         point = point / point[:, 2:] * maps.depth[y, x, None]
-        effects = PointEffects(detail=paint((point - pose.translation) @ pose.rotation))
         reflect = Reflector(reflection_operator("network"), lights[name])
         radiance = np.zeros((64, 64, 3))
-        radiance[y, x] = reflect(
-            Reflectance(**MATERIAL), maps.normal[y, x].astype(float), maps.view[y, x].astype(float), effects=effects
-        )
+        normals, views = (each[y, x].astype(float) for each in (maps.normal, maps.view))
+        diffuse, specular = reflect.parts(Reflectance(**MATERIAL), normals, views)
+        radiance[y, x] = diffuse * paint((point - pose.translation) @ pose.rotation) + specular
         inside = (maps.label > 0).astype(float)
         each = [(kind, a, k) for kind in ("normal", "view") for k, a in enumerate("xyz")]
         channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind, a, k in each}
