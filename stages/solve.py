@@ -196,6 +196,8 @@ def _build_problem(
         name: urm.at_one_exposure(usable_observations(urm.read_observations(t)), relative) for name, t in tables.items()
     }
     observations, known = extract_known(declared, maps, balls, urm.at_one_exposure(observations, relative), lights)
+    if params.solver == "paper":  # its materials are uniform
+        observations = msgspec.structs.replace(observations, detail=None)
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     blocks = blocks_of_observations(
         observations,

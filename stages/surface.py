@@ -1,10 +1,11 @@
-"""Surface detail by shading: normals that differ from those of the meshes as given, from all photos together.
+"""Surface detail by shading: normals and albedo factors that differ from the meshes as given, from all photos together.
 
 Materials and lights are fitted as at the start of the solve.  Normals then turn to explain all photos best, and the
-turns are kept only if they improve held-out photos (`factorlib.inference.surface_detail`).
+turns are kept only if they improve held-out photos (`factorlib.inference.surface_detail`).  Factors on the diffuse
+reflectance are chosen likewise, in addition to the turns.
 
 Writes surface.json, and beginning.json: materials and lights of the first fit, from which `solve` continues.  If
-surfaces differ, it writes photos/<photo>.exr: normals, which later stages use instead of those of `align`.
+surfaces differ, it writes photos/<photo>.exr: normals, which later stages use instead of those of `align`, and factors.
 """
 
 from pathlib import Path
@@ -25,6 +26,7 @@ from factorlib.inference.surface_turns import (
     SurfacePositions,
     Surfaces,
     concatenate_positions,
+    zero_detail,
 )
 from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
@@ -45,7 +47,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Choice of surface detail, and the observations it is estimated from."""
 
     shape: Literal["auto", "off"] = "auto"
-    """Normals by shading; auto: used if they improve held-out photos."""
+    """Normals and albedo factors by shading; auto: used if they improve held-out photos."""
     observations: Annotated[int, msgspec.Meta(ge=200)] = 2000
     """Number of a photo's observations, drawn at random, that turns are estimated from."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
@@ -72,15 +74,28 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         for name, pixels in observations.items()
     }
     result = _estimate_surface(params, inputs, observations, attached, surfaces, progress)
-    displacements = {name: values.astype("f4") for name, values in result.displacements.items()}
+    displacements, factors = (
+        {name: values.astype("f4") for name, values in values_by_mesh.items()}
+        for values_by_mesh in (result.displacements, result.log_factors)
+    )
+    # turns of normals and log albedo factors at the nodes of all meshes
+    detail = zero_detail(surfaces.nodes)
     if displacements:
-        turn = surfaces.turns_from_displacements(displacements)
+        detail = msgspec.structs.replace(detail, turn=surfaces.turns_from_displacements(displacements))
+    if factors:
+        detail = msgspec.structs.replace(detail, log_factor=np.concatenate([factors[name] for name in surfaces.meshes]))
+    if displacements or factors:
         (out / "photos").mkdir()
         for name, photo in photos.items():
-            write_exr(out / "photos" / f"{name}.exr", photo.turned_normals(surfaces, turn))
-    evidence = DetailEvidence.from_decision(result.evidence, result.stiffness)
-    by_mesh = {name: values.tolist() for name, values in displacements.items()}
-    table = SurfaceTable(bool(displacements), evidence, result.gains, by_mesh)
+            write_exr(out / "photos" / f"{name}.exr", photo.detail_channels(surfaces, detail))
+    by_mesh = [
+        {name: values.tolist() for name, values in values_by_mesh.items()}
+        for values_by_mesh in (displacements, factors)
+    ]
+    table = SurfaceTable(
+        bool(displacements), DetailEvidence.from_decision(result.evidence, result.stiffness.turn),
+        bool(factors), DetailEvidence.from_decision(result.painted, result.stiffness.factor), result.gains, *by_mesh,
+    )  # fmt: skip
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
     progress(1, 1)

@@ -66,7 +66,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     names = inputs.facts["dataset.materials"]
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     surface = read_surface(inputs.folders.get("surface"))
-    read = MeshCache(inputs.mesh, names, CREASE_DEG, surface.displacements)
+    read = MeshCache(inputs.mesh, names, CREASE_DEG, surface.displacements, surface.log_factors)
     meshes = visible_meshes(read, slices)
     if params.albedo == "off" or not meshes:
         write_json(out / FILE, TextureTable())

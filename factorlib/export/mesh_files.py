@@ -47,7 +47,7 @@ class MeshFiles:
         self.solved = solved
         surface = read_surface(inputs.folders.get("surface"))
         textures = read_textures(inputs.folders.get("texture"))
-        self.read = MeshCache(inputs.mesh, materials, crease_deg, surface.displacements, textures)
+        self.read = MeshCache(inputs.mesh, materials, crease_deg, surface.displacements, surface.log_factors, textures)
         self.images: dict[str, str] = {}
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 

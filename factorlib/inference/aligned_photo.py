@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
-from factorlib.inference.surface_turns import SurfacePositions, Surfaces, attach_pixels
+from factorlib.inference.surface_turns import Detail, SurfacePositions, Surfaces, attach_pixels
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import MeshCache
 from factorlib.results.poses import FILE as POSES
@@ -31,17 +31,22 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
         object_number = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
         return attach_pixels(pixels, object_number, self.poses.camera.camera(width, height), objects, surfaces)
 
-    def turned_normals(self, surfaces: Surfaces, turn: Float[np.ndarray, "v 3"]) -> Channels:
-        """Return normal.x, .y, .z (camera frame) after turns at the nodes; 0 at pixels without a mesh."""
+    def detail_channels(self, surfaces: Surfaces, detail: Detail) -> Channels:
+        """Return normal.x, .y, .z (camera frame) and detail.R, .G, .B (factor on the diffuse reflectance).
+
+        All are 0 at pixels without a mesh.
+        """
         y, x = np.nonzero(self.geometry["object"] > 0.5)
         normal, view = (
             np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
             for kind in ("normal", "view")
         )
         attached = self.attach(np.column_stack([x, y]), surfaces)
-        picture = np.zeros((*self.geometry["object"].shape, 3), np.float32)
-        picture[y, x] = attached.turn_normals(normal, view, turn)
-        return dict(zip((f"normal.{axis}" for axis in "xyz"), np.moveaxis(picture, -1, 0)))
+        picture = np.zeros((*self.geometry["object"].shape, 6), np.float32)
+        picture[y, x, :3] = attached.turn_normals(normal, view, detail.turn)
+        picture[y, x, 3:] = attached.factor(detail.log_factor)
+        names = [*(f"normal.{axis}" for axis in "xyz"), *(f"detail.{channel}" for channel in "RGB")]
+        return dict(zip(names, np.moveaxis(picture, -1, 0)))
 
 
 def read_aligned_photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, AlignedPhoto]:

@@ -11,7 +11,7 @@ from factorlib.inference.background import Background
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
-    *("visibility", "bounced", "confidence", "place", "row"),  # optional columns
+    *("visibility", "bounced", "confidence", "place", "row", "detail"),  # optional columns
 )
 CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
 
@@ -96,6 +96,7 @@ class Block(msgspec.Struct, frozen=True):
         place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
         row: Index of the observation among all usable ones.
         background: Surroundings that the photos show; None if they are not used.
+        detail: Factor on the diffuse reflectance of each observation's material, per channel; None for 1.
     """
 
     name: str
@@ -117,6 +118,7 @@ class Block(msgspec.Struct, frozen=True):
     place: Float[np.ndarray, "n 3"] | None = None
     row: Int[np.ndarray, " n"] | None = None
     background: Background | None = None
+    detail: Float[np.ndarray, "n 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -161,6 +163,14 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(
             self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
         )
+
+    def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, "n 3"]) -> Block:
+        """Return the same observations with other normals and with a detail of reflectance.
+
+        The block must have no detail yet.
+        """
+        bounced = None if self.bounced is None else self.bounced * np.hstack([detail, np.ones_like(detail)])
+        return msgspec.structs.replace(self, normal=normal, detail=detail, bounced=bounced)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the whitened residuals of a predicted `radiance`, which is in the block's unit.

@@ -113,6 +113,11 @@ class Illumination(msgspec.Struct, frozen=True):
         """Exposure of each observation's photo, a factor on the light."""
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
+    @property
+    def detail(self) -> Float[np.ndarray, "n 3"]:
+        """Factor on the diffuse reflectance of each observation's material."""
+        return np.ones((len(self.block), 3)) if self.block.detail is None else self.block.detail
+
     def predict(self) -> Prediction:
         """Return the predicted radiance and its components."""
         block = self.block
@@ -132,6 +137,7 @@ class Illumination(msgspec.Struct, frozen=True):
                 diffuse[rows], specular[rows], by_roughness[rows] = lookup.radiance(self.light.weight)
                 responses.append((m, rows, lookup))
         diffuse, specular, by_roughness = (part * self.exposure for part in (diffuse, specular, by_roughness))
+        diffuse = diffuse * self.detail
         if block.bounced is not None:
             diffuse = diffuse + block.bounced[:, :3]
             specular = specular + block.bounced[:, 3:]
@@ -169,7 +175,7 @@ class Illumination(msgspec.Struct, frozen=True):
         # A = (k_d D + k_s S) e τ'/σ, linearised at the observed radiance
         slope = self.light.tone_slope(block.radiance[rows], block.photo[rows])
         scale = block.precision[rows] * slope * self.exposure[rows]
-        kd = self.materials.diffuse[block.material[rows]]
+        kd = self.materials.diffuse[block.material[rows]] * self.detail[rows]
         ks = self.materials.specular[block.material[rows]]
         return np.stack(
             [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
@@ -202,6 +208,7 @@ class Illumination(msgspec.Struct, frozen=True):
         # Σ a ∂ℓ/∂(log k_d, log k_s, roughness), and Dᵀ a e k_d + Sᵀ a e k_s with respect to w
         by_materials = np.zeros((len(self.materials), 7))
         by_weight = np.zeros((len(light), 3))
+        detail = self.detail
         for m, rows, lookup in prediction.responses:
             kd = self.materials.diffuse[m]
             ks = self.materials.specular[m]
@@ -210,7 +217,7 @@ class Illumination(msgspec.Struct, frozen=True):
             by_materials[m, 3:6] = ks * (a * prediction.specular[rows]).sum(0)
             by_materials[m, 6] = float((ks * a * prediction.by_roughness[rows]).sum())
             lit = a * self.exposure[rows]
-            by_weight += lookup.by_weight(lit * kd, lit * ks)
+            by_weight += lookup.by_weight(lit * kd * detail[rows], lit * ks)
         # gradient by log radiance of free cells, log exposures, log tone exponents and the log factor on held cells
         by_cells = by_weight * light.weight
         by_photo = np.bincount(block.photo, (by_linear * from_light).sum(1), len(light.log_exposure))
@@ -249,6 +256,7 @@ class Illumination(msgspec.Struct, frozen=True):
         rising = scale * light.tone_slope(prediction.radiance, self.block.photo)  # ∂r/∂ℓ
         by_photos = self._by_photos(prediction, scale, rising)
         free = light.free if light.fixed.any() else slice(None)
+        detail = self.detail.astype(np.float32)
         for m, rows, lookup in prediction.responses:
             unit_specular = lookup.specular
             unit_slope = lookup.by_roughness
@@ -260,7 +268,7 @@ class Illumination(msgspec.Struct, frozen=True):
                 by_roughness = unit_slope * (ks * bright)
                 factors = ((kd, prediction.diffuse), (ks, prediction.specular), (ks, prediction.by_roughness))
                 by_material = np.column_stack([k * values[rows, c] * rising[rows, c] for k, values in factors])
-                diffuse = lookup.diffuse * (kd * bright)
+                diffuse = lookup.diffuse * (kd * detail[rows, c, None] * bright)
                 specular = unit_specular * (ks * bright)
                 by_photo = by_photos[c][rows]
                 if light.scale_free:  # ∂r/∂ log of the factor on known cells

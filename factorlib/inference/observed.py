@@ -175,7 +175,7 @@ def _block(
         visibility = observations.visibility
         directions = np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
     bounced = bounced_light(observations, scaled)
-    return Block(
+    block = Block(
         name, tuple(photos), unit, normal, view, scaled,
         observations.clipped.astype(bool), noise.precision(scaled, observations.weight),
         observations.material.astype(np.int64), local, held_out, visibility, directions,
@@ -183,6 +183,9 @@ def _block(
         None if observations.confidence is None else observations.confidence.astype(float),
         None if observations.place is None else _rotate(observations.place, observations, turned), rows[order],
     )  # fmt: skip
+    if observations.detail is None or (observations.detail == 1).all():
+        return block
+    return block.on_surface(block.normal, observations.detail.astype(float))
 
 
 def _rotate_units(

@@ -1,4 +1,4 @@
-"""Surface detail: turned normals, chosen with their stiffness by held-out photos.
+"""Surface detail: normals and albedo factors, chosen with their stiffness by held-out photos.
 
 start       Materials and lights are fitted on few cells, with the shadows and interreflection of the given meshes.
             Lights are infinitely far away: near lights absorb what turns of wrong normals should explain (rough set of
@@ -12,6 +12,9 @@ decision    Turns are kept if the photos' log Bayes factor, summed, exceeds `VER
             six photos are too few: they refused turns with log Bayes factors of 100 to 317, by which relit pictures
             gain 1.0 and 3.4 dB (data/eames, captured set of seed 128).  Exact surfaces have negative ones.  Of several
             meshes, one stays as it is if the log Bayes factor of its turns alone does not exceed that.
+paint       Factors on the diffuse reflectance are chosen likewise, with a stiffness of `FACTOR_STIFFNESSES`, in
+            addition to the turns.  They are kept if the likelihood is higher by more than `CLEARLY_FOR` standard errors
+            over photos and held-out observations are explained better.
 nodes       Only nodes that two photos or more show turn.
 rounds      Turns are estimated from all lights, and materials and lights are fitted again, `ROUNDS` times.
 surface     The result is the displacement whose normals are nearest to the turned ones.  It excludes turns that no
@@ -33,6 +36,7 @@ from factorlib.inference.fit import Fit, FitSchedule, fit_problem, light_likelih
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     CLEARLY_AGAINST,
+    CLEARLY_FOR,
     TRIAL,
     TRIAL_CELLS,
     VERY_STRONG,
@@ -47,17 +51,21 @@ from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import InitialFit, Start, refine_cells
 from factorlib.inference.surface_turns import (
+    Detail,
     LightTerms,
+    Stiffness,
     SurfacePositions,
     Surfaces,
     linearise_light,
-    solve_turns,
+    solve_detail,
+    zero_detail,
 )
 from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.results.materials import Decision
 
-# a of `factorlib.inference.surface_turns`; b is a share of it.
+# Stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it.
 TURN_STIFFNESSES = (1000.0, 300.0, 100.0, 30.0, 10.0)
+FACTOR_STIFFNESSES = (300.0, 100.0, 30.0, 10.0)  # stiffness of log factors
 ROUNDS = 3
 CELLS = 250  # cells of a light
 FOLDS = 4  # folds of photos
@@ -72,26 +80,29 @@ class SurfaceEstimate(msgspec.Struct, frozen=True):
 
     Attributes:
         beginning: Fit on few cells to the meshes as they are, from which a solve starts.
-        evidence: Decision on turns, by held-out photos.
-        stiffness: Stiffness of the chosen turns; None if they are not kept.
-        gains: Decrease of −2 log marginal likelihood of each held-out photo by the kept turns.
+        evidence: Decision on turns, by held-out observations of held-out photos.
+        painted: Decision on detail of reflectance, likewise.
+        stiffness: Stiffness of the chosen detail.
+        gains: Decrease of −2 log marginal likelihood of each held-out photo by the kept detail.
         displacements: Displacements at the nodes of each moved mesh, in units of the mesh's extent.
+        log_factors: Log factors at the nodes of each mesh; empty if they are not kept.
     """
 
     beginning: InitialFit
     evidence: Decision
-    stiffness: float | None = None
+    painted: Decision = Decision(False)
+    stiffness: Stiffness = Stiffness(None)
     gains: dict[str, float] = {}
     displacements: dict[str, Float[np.ndarray, " n"]] = {}
+    log_factors: dict[str, Float[np.ndarray, " n"]] = {}
 
 
 ProgressReport = Callable[[float, str], None]  # completed share, and the current activity
 Tick = Callable[..., None]  # called at the end of each unit of work
-Turns = Float[np.ndarray, "v 3"]  # δ at all nodes
 
 
 class PhotoScores(msgspec.Struct, frozen=True):
-    """Scores of each photo, with turns that were estimated from other photos.
+    """Scores of each photo, with detail that was estimated from other photos.
 
     Attributes:
         values: −2 log marginal likelihood of each photo.
@@ -106,18 +117,25 @@ class PhotoScores(msgspec.Struct, frozen=True):
         gains = reference.values - self.values
         return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
-    def evidence_over(self, reference: PhotoScores) -> Decision:
-        """Return the decision on turns: kept if their log Bayes factor exceeds `VERY_STRONG`."""
-        factor = float((reference.values - self.values).sum()) / 2
-        evidence = compare_models(reference.losses, self.losses, 0.0)
-        return msgspec.structs.replace(evidence, accepted=factor > VERY_STRONG, log_bayes_factor=factor)
+
+def decide_turns(scores: PhotoScores, reference: PhotoScores) -> Decision:
+    """Return the decision on turns: kept if the log Bayes factor of the photos exceeds `VERY_STRONG`."""
+    log_bayes_factor = float((reference.values - scores.values).sum()) / 2
+    evidence = compare_models(reference.losses, scores.losses, 0.0)
+    return msgspec.structs.replace(evidence, accepted=log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
+
+
+def decide_paint(scores: PhotoScores, reference: PhotoScores) -> Decision:
+    """Return the decision on log factors: kept if likelihood and held-out losses are better, the former clearly."""
+    evidence = compare_models(reference.losses, scores.losses, 0.0)
+    return msgspec.structs.replace(evidence, accepted=evidence.accepted and scores.gain_over(reference) > CLEARLY_FOR)
 
 
 class DetailTrial(msgspec.Struct, frozen=True):
     """Baseline of a search for surface detail: the problem on the bare meshes, its fit, and where observations lie.
 
     Attributes:
-        problem: Observations.
+        problem: Observations, without detail.
         fit: Fit to them.
         surfaces: Subdivided meshes.
         attached: Mesh nodes of each observation, by block.
@@ -130,27 +148,23 @@ class DetailTrial(msgspec.Struct, frozen=True):
     attached: list[SurfacePositions]
     prior: LightPrior
 
-    def with_turns(self, turn: Turns) -> JointProblem:
-        """Return the problem with turned normals."""
+    def with_detail(self, detail: Detail) -> JointProblem:
+        """Return the problem on a surface with detail."""
         blocks = zip(self.problem.blocks, self.attached, strict=True)
-        return self.problem.with_blocks([positions.turn_block(block, turn) for block, positions in blocks])
+        return self.problem.with_blocks([detail.apply_to(block, positions) for block, positions in blocks])
 
-    def linearise(self, turn: Turns, fit: Fit) -> list[LightTerms]:
-        """Linearise every light at turned normals."""
-        tasks = zip(self.with_turns(turn).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
+    def linearise(self, detail: Detail, fit: Fit) -> list[LightTerms]:
+        """Linearise every light on a surface with detail."""
+        tasks = zip(self.with_detail(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
         nodes = self.surfaces.nodes
         return list(
             self.problem.spread(lambda task: linearise_light(task[0], task[1], self.prior, task[2], nodes), list(tasks))
         )
 
-    def restrict_turns(self, turn: Turns, meshes: set[str]) -> Turns:
-        """Return the turns on some meshes alone, called `meshes`."""
-        return np.where(self.surfaces.node_mask(meshes)[:, None], turn, 0.0)
-
-    @property
-    def no_turns(self) -> Turns:
-        """Turns of the mesh itself, all zero."""
-        return np.zeros((self.surfaces.nodes, 3))
+    def restrict_turns(self, detail: Detail, meshes: set[str]) -> Detail:
+        """Return the detail with turns on some meshes alone, called `meshes`."""
+        turn = np.where(self.surfaces.node_mask(meshes)[:, None], detail.turn, 0.0)
+        return msgspec.structs.replace(detail, turn=turn)
 
     @property
     def photos(self) -> list[tuple[int, int]]:
@@ -177,28 +191,30 @@ class DetailTrial(msgspec.Struct, frozen=True):
         return [self.problem.blocks[k].photos[j] for k, j in self.photos]
 
     def score_photos(
-        self, turns: Sequence[Turns], tick: Tick = lambda: None, plain: PhotoScores | None = None
+        self, details: Sequence[Detail], tick: Tick = lambda: None, plain: PhotoScores | None = None
     ) -> PhotoScores:
-        """Score every photo by itself, with the turns for it, in a light fitted to it, with the materials fixed.
+        """Score every photo by itself, on the detail for it, in a light that is fitted to it, with the materials fixed.
 
         Args:
-            turns: Turns for each photo, estimated from other photos.
+            details: Detail for each photo, estimated from other photos.
             tick: Called after each photo.
-            plain: Scores without turns, used for a photo whose turns are zero; None to compute all.
+            plain: Scores without detail, used for a photo whose detail is zero; None to compute all.
         """
 
-        def score(task: tuple[int, tuple[int, int], Turns]) -> tuple[float, Losses]:
+        def score(task: tuple[int, tuple[int, int], Detail]) -> tuple[float, Losses]:
             """Return one photo's value and losses."""
-            index, (k, number), turn = task
+            index, (k, number), detail = task
             rows = self.problem.blocks[k].photo == number
             positions = self.attached[k].take(rows)
-            if plain is not None and not np.any(turn[positions.node]):
+            if plain is not None and not (
+                np.any(detail.turn[positions.node]) or np.any(detail.log_factor[positions.node])
+            ):
                 tick()
                 return plain.values[index], Losses([plain.losses.values[index]], [plain.losses.clusters[index]])
             photo = msgspec.structs.replace(self.problem.blocks[k].take(rows), row=np.arange(rows.sum()))
             photo = photo.subsample(OBSERVATIONS, seed=0)
             assert photo.row is not None
-            problem = self.problem.with_blocks([positions.take(photo.row).turn_block(photo, turn)])
+            problem = self.problem.with_blocks([detail.apply_to(photo, positions.take(photo.row))])
             # the photo's own light, from the light of its illumination
             start = Point(self.fit.point.materials, [self.fit.point.lights[k]])
             (illumination,) = problem.without_held_out().illuminations(start)
@@ -208,7 +224,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
             tick()
             return likelihood.marginal(system), losses
 
-        tasks = [(index, *task) for index, task in enumerate(zip(self.photos, turns, strict=True))]
+        tasks = [(index, *task) for index, task in enumerate(zip(self.photos, details, strict=True))]
         values, losses = zip(*self.problem.spread(score, tasks), strict=True)
         return PhotoScores(np.array(values), Losses(*([photo[i][0] for photo in losses] for i in (0, 1))))
 
@@ -216,24 +232,26 @@ class DetailTrial(msgspec.Struct, frozen=True):
         self,
         parts: list[LightTerms],
         laplacian: csr_array,
-        stiffness: float,
+        stiffness: Stiffness,
+        movable: Bool[np.ndarray, " v"],
         tick: Tick,
-    ) -> list[Turns]:
-        """Return the turns for every photo, estimated from other photos.
+    ) -> list[Detail]:
+        """Return the surface detail for every photo, estimated from other photos.
 
-        Photos are split into at most `FOLDS` folds; the turns for a photo are estimated from all other folds.
+        Photos are split into at most `FOLDS` folds; the detail for a photo is estimated from all other folds.
 
         Args:
             parts: Linearised lights on the mesh itself.
             laplacian: Laplacian of all meshes.
-            stiffness: Stiffness of the turns.
+            stiffness: Stiffness of the detail.
+            movable: Mask of the nodes whose normals may turn.
             tick: Called after each fold.
         """
         photos = self.photos
         folds = min(FOLDS, len(photos))
 
-        def turns_without(fold: int) -> Turns:
-            """Return the turns that are estimated without the photos of one fold."""
+        def detail_without(fold: int) -> Detail:
+            """Return the detail that is estimated without the photos of one fold."""
             left_out = [
                 np.isin(block.photo, [j for n, j in photos[fold::folds] if n == k])
                 for k, block in enumerate(self.problem.blocks)
@@ -241,14 +259,14 @@ class DetailTrial(msgspec.Struct, frozen=True):
             pairs = zip(parts, left_out, strict=True)
             used = [part.drop_observations(rows) if rows.any() else part for part, rows in pairs]
             used = [part for part in used if len(part.residual)]
-            turn = solve_turns(used, laplacian, stiffness, self.no_turns, self.shared_nodes)
+            detail = solve_detail(used, laplacian, stiffness, zero_detail(self.surfaces.nodes), movable)
             positions = [positions.take(~rows) for positions, rows in zip(self.attached, left_out, strict=True)]
             # only turns that a displacement explains
-            displacements = self.surfaces.displacements(turn, positions)
+            displacements = self.surfaces.displacements(detail.turn, positions)
             tick()
-            return self.surfaces.turns_from_displacements(displacements)
+            return Detail(self.surfaces.turns_from_displacements(displacements), detail.log_factor)
 
-        by_fold = list(self.problem.spread(turns_without, range(folds)))
+        by_fold = list(self.problem.spread(detail_without, range(folds)))
         return [by_fold[number % folds] for number in range(len(photos))]
 
 
@@ -257,13 +275,13 @@ class StiffnessChoice(NamedTuple):
 
     Attributes:
         stiffness: Stiffness.
-        turns: Turns for each photo, estimated from other photos.
+        details: Detail for each photo, estimated from other photos.
         scores: Scores of the photos.
-        evidence: Decision on the turns.
+        evidence: Decision on the detail.
     """
 
-    stiffness: float
-    turns: list[Turns]
+    stiffness: Stiffness
+    details: list[Detail]
     scores: PhotoScores
     evidence: Decision
 
@@ -275,7 +293,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
         trial: Problem and its fit.
         parts: Linearised lights on the mesh itself.
         laplacian: Laplacian of all meshes.
-        plain: Scores without turns.
+        plain: Scores without detail.
         tick: Called after each unit of work.
     """
 
@@ -285,39 +303,53 @@ class DetailSearch(msgspec.Struct, frozen=True):
     plain: PhotoScores
     tick: Tick
 
-    def select_stiffness(self) -> StiffnessChoice:
-        """Select the stiffness of the turns with the largest marginal likelihood of the photos.
+    def select_stiffness(
+        self,
+        candidates: Sequence[Stiffness],
+        reference: PhotoScores,
+        decide: Callable[[PhotoScores, PhotoScores], Decision],
+        movable: Bool[np.ndarray, " v"],
+    ) -> StiffnessChoice:
+        """Select the stiffness of the detail with the largest marginal likelihood of the photos.
 
         The search goes from stiff to soft.  It ends at a stiffness that is less likely than the previous one, or
-        with clear evidence against turns.
+        with clear evidence against the detail.
+
+        Args:
+            candidates: Stiffnesses, from stiff to soft.
+            reference: Scores without this detail.
+            decide: Decision on scores with the detail and without it.
+            movable: Mask of the nodes whose normals may turn.
         """
         best: StiffnessChoice | None = None
-        for stiffness in TURN_STIFFNESSES:
-            turns = self.trial.fit_folds(self.parts, self.laplacian, stiffness, self.tick)
-            scores = self.trial.score_photos(turns, self.tick, self.plain)
+        for stiffness in candidates:
+            details = self.trial.fit_folds(self.parts, self.laplacian, stiffness, movable, self.tick)
+            scores = self.trial.score_photos(details, self.tick, self.plain)
             if best is not None and round(float(scores.values.sum() - best.scores.values.sum()), 3) >= 0:
                 break
-            best = StiffnessChoice(stiffness, turns, scores, scores.evidence_over(self.plain))
-            if scores.gain_over(self.plain) < CLEARLY_AGAINST:
+            best = StiffnessChoice(stiffness, details, scores, decide(scores, reference))
+            if scores.gain_over(reference) < CLEARLY_AGAINST:
                 break
         assert best is not None
         return best
 
     def select_turns(self) -> tuple[StiffnessChoice, set[str]]:
         """Choose the stiffness of turned normals; return it with the meshes whose turns improve held-out photos."""
-        best = self.select_stiffness()
-        movable = self.select_meshes(best.turns) if best.evidence.accepted else set()
+        candidates = [Stiffness(a) for a in TURN_STIFFNESSES]
+        turned = self.select_stiffness(candidates, self.plain, decide_turns, self.trial.shared_nodes)
+        movable = self.select_meshes(turned.details) if turned.evidence.accepted else set()
         if 0 < len(movable) < len(self.trial.surfaces.meshes):
-            restricted = [self.trial.restrict_turns(turn, movable) for turn in best.turns]
-            scores = self.trial.score_photos(restricted, self.tick, self.plain)
-            best = best._replace(scores=scores, evidence=scores.evidence_over(self.plain))
-        return best, movable
+            scores = self.trial.score_photos(
+                [self.trial.restrict_turns(detail, movable) for detail in turned.details], self.tick, self.plain
+            )
+            turned = turned._replace(scores=scores, evidence=decide_turns(scores, self.plain))
+        return turned, movable
 
-    def fit_all_photos(self, stiffness: float, movable: set[str], pieces: ProgressSections, seed: int) -> Turns:
-        """Return the turns from all photos, with materials and lights fitted again between their steps.
+    def fit_all_photos(self, stiffness: Stiffness, movable: set[str], pieces: ProgressSections, seed: int) -> Detail:
+        """Return the detail from all photos, with materials and lights fitted again between its steps.
 
         Args:
-            stiffness: Stiffness of the turns.
+            stiffness: Stiffness of the detail.
             movable: Meshes whose normals may turn.
             pieces: Progress report, divided into sections.
             seed: Seed of the drawn observations.
@@ -326,25 +358,26 @@ class DetailSearch(msgspec.Struct, frozen=True):
         parts = self.parts
         fit = self.trial.fit
         nodes = trial.surfaces.node_mask(movable) & trial.shared_nodes
-        turn = trial.no_turns
+        detail = zero_detail(trial.surfaces.nodes)
         for number in range(ROUNDS):
             begin = 0.85 + 0.05 * number
             tick = pieces.section(begin, begin + 0.05, ROUND_SCHEDULE.points, f"all photos, round {number + 1}")
             if number:
-                sample = trial.with_turns(turn).subsample(OBSERVATIONS, seed)
-                fit = fit_problem(sample, fit, trial.prior, ROUND_SCHEDULE, tick)
-                parts = trial.linearise(turn, fit)
-            turn = solve_turns(parts, self.laplacian, stiffness, turn, nodes)
-        return turn
+                fit = fit_problem(
+                    trial.with_detail(detail).subsample(OBSERVATIONS, seed), fit, trial.prior, ROUND_SCHEDULE, tick
+                )
+                parts = trial.linearise(detail, fit)
+            detail = solve_detail(parts, self.laplacian, stiffness, detail, nodes)
+        return detail
 
-    def select_meshes(self, turns: Sequence[Turns]) -> set[str]:
+    def select_meshes(self, turned: Sequence[Detail]) -> set[str]:
         """Return the meshes whose turns alone, without those of other meshes, improve held-out photos."""
         names = self.trial.surfaces.meshes
         if len(names) == 1:
             return set(names)
-        restricted = [(name, [self.trial.restrict_turns(turn, {name}) for turn in turns]) for name in names]
-        scores = {name: self.trial.score_photos(turns, self.tick, self.plain) for name, turns in restricted}
-        return {name for name, mesh_scores in scores.items() if mesh_scores.evidence_over(self.plain).accepted}
+        restricted = [(name, [self.trial.restrict_turns(detail, {name}) for detail in turned]) for name in names]
+        scores = {name: self.trial.score_photos(details, self.tick, self.plain) for name, details in restricted}
+        return {name for name, mesh_scores in scores.items() if decide_turns(mesh_scores, self.plain).accepted}
 
 
 def estimate_surface(
@@ -355,7 +388,7 @@ def estimate_surface(
     seed: int = 0,
     report: ProgressReport = lambda share, activity: None,
 ) -> SurfaceEstimate:
-    """Return the detail of the meshes, if photos gain from turns that were estimated without them.
+    """Return the detail of the meshes, if photos gain from detail that was estimated without them.
 
     Args:
         problem: All observations.
@@ -366,28 +399,37 @@ def estimate_surface(
         report: Called with the completed share and the current activity.
     """
     pieces = ProgressSections(report)
+    plain = zero_detail(surfaces.nodes)
     tick = pieces.section(0.0, 0.3, TRIAL.points + START_SCHEDULE.points, "materials and lights")
     trial, initial = fit_trial(problem, start, seed, (surfaces, attached), tick)
     photos = len(trial.photos)
     if photos < 2 or problem.none_held_out:
         return SurfaceEstimate(initial, Decision(False))
-    tick = pieces.section(0.3, 0.85, 2 * len(TURN_STIFFNESSES) * photos, "left-out photos")
-    scores = trial.score_photos([trial.no_turns] * photos, tick)
-    search = DetailSearch(trial, trial.linearise(trial.no_turns, trial.fit), surfaces.laplacian(), scores, tick)
-    best, movable = search.select_turns()
-    if not best.evidence.accepted:
-        return SurfaceEstimate(initial, best.evidence)
-    gains = dict(zip(trial.names, (scores.values - best.scores.values).tolist(), strict=True))
-    turn = search.fit_all_photos(best.stiffness, movable, pieces, seed)
-    displacements = surfaces.displacements(turn, attached)
+    tick = pieces.section(0.3, 0.85, 4 * len(TURN_STIFFNESSES) * photos, "left-out photos")
+    scores = trial.score_photos([plain] * photos, tick)
+    search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), scores, tick)
+    turned, movable = search.select_turns()
+    unturned = StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
+    selected = turned if turned.evidence.accepted else unturned
+    candidates = [Stiffness(selected.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
+    nodes = trial.shared_nodes & surfaces.node_mask(movable)
+    painted = search.select_stiffness(candidates, selected.scores, decide_paint, nodes)
+    selected = painted if painted.evidence.accepted else selected
+    if not (turned.evidence.accepted or painted.evidence.accepted):
+        return SurfaceEstimate(initial, turned.evidence, painted.evidence)
+    gains = dict(zip(trial.names, (scores.values - selected.scores.values).tolist(), strict=True))
+    detail = search.fit_all_photos(selected.stiffness, movable, pieces, seed)
+    displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.accepted else {}
     displacements = {name: displacement for name, displacement in displacements.items() if name in movable}
-    return SurfaceEstimate(initial, best.evidence, best.stiffness, gains, displacements)
+    factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.accepted else {}
+    decisions = turned.evidence, painted.evidence
+    return SurfaceEstimate(initial, *decisions, selected.stiffness, gains, displacements, factors)
 
 
 def fit_trial(
     problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[SurfacePositions]], tick: Tick
 ) -> tuple[DetailTrial, InitialFit]:
-    """Return the problem on the bare meshes with its fit, and the fit on few cells.
+    """Return the problem without detail with its fit, and the fit on few cells.
 
     Shadows and interreflection are those of the given meshes.
 

@@ -5,11 +5,14 @@ shows the nodes v_1, v_2, v_3 with barycentric coordinates b_k has the normal
 
     n' = unit(n + P R Σ_k b_k δ_{v_k}),     R: light's frame from object's, P = 1 − n nᵀ                             (1)
 
-Let r be the residuals of one light, in σ, weighted by the robust loss and divided by √T.  Let J = ∂r/∂δ, U = ∂r/∂u, and
-H = UᵀU + Q_u the Hessian of that light with the gradient g.  Lights respond to a step dδ by −H⁻¹(Uᵀ J dδ + g).  With
+A node may also have a log factor on the diffuse reflectance of each channel: patina, grain, dirt.  Both are unknowns x
+of a node.
+
+Let r be the residuals of one light, in σ, weighted by the robust loss and divided by √T.  Let J = ∂r/∂x, U = ∂r/∂u, and
+H = UᵀU + Q_u the Hessian of that light with the gradient g.  Lights respond to a step dx by −H⁻¹(Uᵀ J dx + g).  With
 them eliminated, the step minimises, up to a constant,
 
-    Σ_lights [dδᵀ Jᵀ(1 − U H⁻¹ Uᵀ)J dδ + 2 dδᵀ Jᵀ(r − U H⁻¹ g)]  +  a Σ_edges |δ_i − δ_j|² + b Σ_v |δ_v|²           (2)
+    Σ_lights [dxᵀ Jᵀ(1 − U H⁻¹ Uᵀ)J dx + 2 dxᵀ Jᵀ(r − U H⁻¹ g)]  +  a Σ_edges |x_i − x_j|² + b Σ_v |x_v|²           (2)
 
 Lights must respond: given lights keep what they had absorbed of wrong normals, and normals stay wrong (measured: median
 error 4.3° → 3.9° instead of 3.1°).  ∂r/∂n is a finite difference of the forward model along two tangents.  Conjugate
@@ -25,7 +28,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import block_diag, csr_array, diags_array, eye_array, kron
+from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, kron
 from scipy.sparse.linalg import LinearOperator, cg
 
 from factorlib.geometry.camera import Camera
@@ -75,6 +78,10 @@ class SurfacePositions(msgspec.Struct, frozen=True):
         rows, columns = (np.broadcast_to(index, values.shape).reshape(-1) for index in (rows, columns))
         return csr_array((values.reshape(-1), (rows, columns)), (3 * len(self.node), 3 * nodes))
 
+    def factor(self, log_factor: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the factor on the diffuse reflectance of each observation."""
+        return np.exp(np.einsum("nk,nkc->nc", self.share, log_factor[self.node]))
+
     def turn_normals(
         self, normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "v 3"]
     ) -> Float[np.ndarray, "n 3"]:
@@ -94,10 +101,6 @@ class SurfacePositions(msgspec.Struct, frozen=True):
         turned = normal + turned * np.minimum(1, LARGEST_TURN / np.maximum(length, 1e-12))
         turned /= np.linalg.norm(turned, axis=1, keepdims=True)
         return np.where(np.sum(turned * view, 1, keepdims=True) < LEAST_VIEW_COSINE, normal, turned)
-
-    def turn_block(self, block: Block, turn: Float[np.ndarray, "v 3"]) -> Block:
-        """Return the block with turned normals."""
-        return msgspec.structs.replace(block, normal=self.turn_normals(block.normal, block.view, turn))
 
 
 def concatenate_positions(parts: Sequence[SurfacePositions]) -> SurfacePositions:
@@ -198,11 +201,33 @@ def attach_pixels(
     return SurfacePositions(node, share, frame)
 
 
+class Detail(msgspec.Struct, frozen=True):
+    """Detail of a surface beyond its mesh and materials, at v nodes.
+
+    Attributes:
+        turn: δ of the normals.
+        log_factor: Logarithm of a factor on diffuse reflectance, per channel.
+    """
+
+    turn: Float[np.ndarray, "v 3"]
+    log_factor: Float[np.ndarray, "v 3"]
+
+    def apply_to(self, block: Block, attached: SurfacePositions) -> Block:
+        """Return the block, which has no detail, with this detail."""
+        normal = attached.turn_normals(block.normal, block.view, self.turn)
+        return block.on_surface(normal, attached.factor(self.log_factor))
+
+
+def zero_detail(nodes: int) -> Detail:
+    """Return the detail of the mesh itself, all zero."""
+    return Detail(np.zeros((nodes, 3)), np.zeros((nodes, 3)))
+
+
 class LightTerms(msgspec.Struct, frozen=True, dict=True):
     """Terms of one light in (2).
 
     Attributes:
-        slopes: J.
+        slopes: J [3n, 6v], by turns and by log factors.
         residual: r.
         by_light: U by channel: a channel's residuals depend on its own p cells, and on q exposures and tone exponents
             that all channels share.
@@ -211,7 +236,7 @@ class LightTerms(msgspec.Struct, frozen=True, dict=True):
         cells: p.
     """
 
-    slopes: csr_array  # [3n, 3v]
+    slopes: csr_array  # [3n, 6v], by turns and by log factors
     residual: Float[np.ndarray, " 3n"]
     by_light: Float[np.ndarray, "3 n p+q"]
     hessian: Float[np.ndarray, "l l"]
@@ -265,7 +290,7 @@ def linearise_light(
     attached: SurfacePositions,
     nodes: int,
 ) -> LightTerms:
-    """Linearise one light at its block's normals.
+    """Linearise one light at its block's normals and detail.
 
     Held-out observations have weight 0.
 
@@ -283,16 +308,21 @@ def linearise_light(
     prediction = tabulated.predict()
     residual = np.zeros((n, 3))
     by_light = np.zeros((3, n, tabulated.light.unknowns - 2 * p), np.float32)
-    # r and U, row by row
+    by_factor = np.zeros((n, 3))
+    # r, ∂r/∂log k_d and U, row by row
     for line in tabulated.linearise(prediction, FIT_LOSS, hyperparameters.temperature):
         residual[line.rows, line.channel] = line.residual
+        by_factor[line.rows, line.channel] = line.by_material[:, 0]  # ∂r/∂log k_d
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
     system = likelihood.normal_equations(materials_given=True)
     whitened = illumination.block.residuals(prediction.radiance)
     weight = tabulated.root_weights(whitened, FIT_LOSS, hyperparameters.temperature)
-    # J = ∂r/∂n R b
+    # J = [∂r/∂n R b, ∂r/∂log k_d b]
     slopes = (_normal_derivatives(illumination) * weight[:, :, None]).reshape(3 * n, 3)
-    turning = csr_array(_block_diagonal(slopes) @ attached.operator(nodes))
+    factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)
+    columns = 3 * attached.node.repeat(3, axis=0) + np.tile(np.arange(3), n)[:, None]
+    painted = csr_array((factors.reshape(-1), (np.arange(3 * n).repeat(3), columns.reshape(-1))), (3 * n, 3 * nodes))
+    turning = csr_array(hstack([_block_diagonal(slopes) @ attached.operator(nodes), painted]))
     return LightTerms(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
 
 
@@ -320,28 +350,43 @@ def _normal_derivatives(illumination: Illumination) -> Float[np.ndarray, "n 3 3"
     return result
 
 
-def solve_turns(
+class Stiffness(msgspec.Struct, frozen=True):
+    """Stiffness a of (2); None keeps the quantity fixed.
+
+    Attributes:
+        turn: Stiffness of turns.
+        factor: Stiffness of log factors.
+    """
+
+    turn: float | None
+    factor: float | None = None
+
+
+def solve_detail(
     parts: Sequence[LightTerms],
     laplacian: csr_array,
-    stiffness: float,
-    turn: Float[np.ndarray, "v 3"],
+    stiffness: Stiffness,
+    detail: Detail,
     movable: Bool[np.ndarray, " v"] | None = None,
-) -> Float[np.ndarray, "v 3"]:
-    """Return the turns of all nodes that minimise (2).
+) -> Detail:
+    """Return the turns and log factors of all nodes that minimise (2).
 
     Args:
         parts: Linearised lights.
         laplacian: Laplacian of all meshes.
-        stiffness: a of (2).
-        turn: Turns at which the parts were linearised.
+        stiffness: Stiffness of the detail.
+        detail: Detail at which the parts were linearised.
         movable: Mask of the nodes whose normals may turn; None for all.
     """
-    unknowns = turn.reshape(-1).copy()
-    free = np.repeat(np.ones(len(turn), bool) if movable is None else movable, 3)
-    # a L + b 1, (2), for three axes
-    roughness = csr_array(laplacian + PULL_SHARE * eye_array(len(turn)))
-    prior = kron(stiffness * roughness, np.eye(3)).tocsr()[free][:, free]
+    v = len(detail.log_factor)
+    unknowns = np.concatenate([detail.turn.reshape(-1), detail.log_factor.reshape(-1)])
+    roughness = csr_array(laplacian + PULL_SHARE * eye_array(v))
+    # a L + b 1 for turns (three axes) and log factors (three channels), (2)
+    prior = block_diag([kron((a or 0) * roughness, np.eye(3)) for a in (stiffness.turn, stiffness.factor)])
+    turning = np.repeat(np.ones(v, bool) if movable is None else movable, 3) & (stiffness.turn is not None)
+    free = np.append(turning, np.full(3 * v, stiffness.factor is not None))
     slopes = [part.slopes[:, free] for part in parts]
+    prior = prior.tocsr()[free][:, free]
     # −gradient, and the diagonal of the Hessian for the Jacobi preconditioner
     target = -(prior @ unknowns[free])
     diagonal = prior.diagonal()
@@ -359,4 +404,4 @@ def solve_turns(
         LinearOperator(size, system, dtype=float), target, rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
     )
     unknowns[free] += step
-    return unknowns.reshape(-1, 3)
+    return Detail(*unknowns.reshape(2, v, 3))

@@ -74,6 +74,7 @@ class MeshCache:
     materials       materials of the dataset
     crease_deg      crease angle, as in `read_mesh`
     displacements   by mesh, displacements at the nodes that `surface` estimated; the mesh is subdivided and moved
+    log_factors     by mesh, logarithms of the detail at the nodes that `surface` estimated
     textures        by mesh, longest edge of the subdivided mesh, and factors at its nodes by material, from `texture`
     """
 
@@ -83,12 +84,14 @@ class MeshCache:
         materials: Sequence[str],
         crease_deg: float,
         displacements: Mapping[str, Sequence[float]] = {},
+        log_factors: Mapping[str, Sequence[tuple[float, float, float]]] = {},
         textures: Mapping[str, tuple[float, Mapping[str, Float[np.ndarray, "v 3"]]]] = {},
     ):
         self.path = path
         self.materials = materials
         self.crease_deg = crease_deg
         self.displacements = displacements
+        self.log_factors = log_factors
         self.textures = textures
         self._meshes: dict[tuple, Mesh] = {}
 
@@ -110,11 +113,13 @@ class MeshCache:
         if key not in self._meshes:
             file = self.path(name, entry.file)
             mesh = read_mesh(file, self.materials, entry.part_materials, overrides, self.crease_deg, NO_LIMITS)
-            if name in self.displacements:
+            if name in self.displacements or name in self.log_factors:
                 dense = subdivided_mesh(mesh)
-                displacement = np.array(self.displacements[name])
-                _check_nodes([displacement], dense, file, "surface")
-                mesh = dense.displace(displacement)
+                still = np.zeros(dense.nodes)
+                moves, factors = (np.array(table.get(name, still)) for table in (self.displacements, self.log_factors))
+                _check_nodes([moves, factors], dense, file, "surface")
+                detail = np.exp(factors)[dense.node] if name in self.log_factors else None
+                mesh = msgspec.structs.replace(dense.displace(moves), detail=detail)
             self._meshes[key] = self._textured(mesh, name, file)
         return self._meshes[key]
 
@@ -131,7 +136,7 @@ class MeshCache:
         labels = [label for label in mesh.labels if self.materials[label - 1] in factors]
         if not labels:
             return fine.mesh
-        detail = np.ones((len(fine.mesh.vertices), 3))
+        detail = np.ones((len(fine.mesh.vertices), 3)) if fine.mesh.detail is None else fine.mesh.detail.copy()
         for label in labels:
             vertices = np.unique(fine.mesh.faces[fine.mesh.face_label == label])
             detail[vertices] = factors[self.materials[label - 1]][fine.node[vertices]]

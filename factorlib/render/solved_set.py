@@ -66,7 +66,8 @@ class SolvedSet:
         self.photos = list(self.objects)
         surface = read_surface(inputs.folders.get("surface"))
         textures = read_textures(inputs.folders.get("texture"))
-        self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, surface.displacements, textures)
+        moved = surface.displacements, surface.log_factors
+        self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, *moved, textures)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:

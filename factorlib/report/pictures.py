@@ -211,31 +211,34 @@ def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]
 
 
 def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[dict[str, Any]]:
-    """Return a row for every mesh with displacements or textures, sorted by name.
+    """Return a row for every mesh with displacements, detail of reflectance or textures, sorted by name.
 
     `uris` are pictures by title, of the mesh as given and as refined, in the photo that shows most of it.  `typical` is
     the RMS displacement and `largest` the largest, over the extent.
     """
     rows = []
     table = run.surface
-    for mesh in sorted({*table.displacements, *run.texture.longest}):
+    for mesh in sorted({*table.displacements, *table.log_factors, *run.texture.longest}):
         masks = {}
         for photo, slice_ in objects.items():
             numbers = [number for number, obj in enumerate(slice_.objects, start=1) if obj.mesh == mesh]
             masks[photo] = np.isin(np.rint(run.channels("align", photo)["object"]), numbers or [-1])
         photo = max(masks, key=lambda name: int(masks[name].sum()))
         maps = {"as given": run.channels("align", photo)}
-        if table.moved:
+        if table.moved or table.painted:
             maps["by shading"] = run.channels("surface", f"photos/{photo}")
         normals = {kind: np.stack([each[f"normal.{a}"] for a in "xyz"], axis=-1) for kind, each in maps.items()}
         panels = {
             f"clay, {kind}": srgb_encode(0.03 + 0.5 * np.maximum(n @ CLAY_LIGHT, 0)) for kind, n in normals.items()
         }
         panels |= {f"normals, {kind}": 0.5 + 0.5 * n * (1, -1, -1) for kind, n in normals.items()}
+        paint = {"detail of reflectance": maps["by shading"]} if mesh in table.log_factors else {}
         if mesh in run.texture.longest:
-            paint = run.channels("texture", f"photos/{photo}")
-            factor = np.stack([paint[f"detail.{c}"] for c in "RGB"], axis=-1)
-            panels["texture, a factor on the diffuse reflectance"] = srgb_encode(np.clip(0.4 * factor, 0, 1))
+            paint = {"texture, a factor on the diffuse reflectance": run.channels("texture", f"photos/{photo}")}
+        panels |= {
+            title: srgb_encode(np.clip(0.4 * np.stack([each[f"detail.{c}"] for c in "RGB"], axis=-1), 0, 1))
+            for title, each in paint.items()
+        }
         uris = {}
         box = mask_box(masks[photo])
         longest = longest_side(len(run.set.photos))

@@ -41,16 +41,22 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     Attributes:
         moved: True if surfaces differ from the given meshes
         moved_by: evidence for it
+        painted: True if diffuse reflectance has detail, beyond what moved surfaces explain
+        painted_by: evidence for it
         gains: by photo: decrease of minus twice the log marginal likelihood of its observations, without a part in the
             surface
         displacements: by mesh: along the normal at each node of the subdivided mesh (`meshes.subdivision`), in
             units of the mesh's extent
+        log_factors: by mesh: log factor on diffuse reflectance at each node, per channel
     """
 
     moved: bool = False
     moved_by: DetailEvidence = DetailEvidence()
+    painted: bool = False
+    painted_by: DetailEvidence = DetailEvidence()
     gains: dict[str, float] = {}
     displacements: dict[str, list[float]] = {}
+    log_factors: dict[str, list[tuple[float, float, float]]] = {}
 
 
 def read_surface(folder: str | Path | None) -> SurfaceTable:

@@ -113,7 +113,7 @@ def read_geometry(
 ) -> dict[str, Float[np.ndarray, "h w"]]:
     """Read the maps that `align` wrote of a photo.
 
-    Normals of `surface` replace them, and detail.R, G, B of `texture` are added.
+    Normals of `surface` replace them, and its detail.R, G, B are added; those of `texture` replace these.
 
     Args:
         align: Folder of the stage `align`.
@@ -128,7 +128,7 @@ def read_geometry(
 
 
 def with_surface_normals(observations: Observations, surface: Path | None) -> Observations:
-    """Replace normals of one photo's observations by those in the folder of `surface`, if it has any.
+    """Replace normals and detail of one photo's observations by those in the folder of `surface`, if it has any.
 
     A merged observation gets the normal of the first pixel of its group.
 
@@ -148,8 +148,10 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
         )
     normal = np.stack([maps[f"normal.{axis}"][observations.y, observations.x] for axis in "xyz"], axis=-1)
     known = (normal != 0).any(1, keepdims=True)
+    detail = np.stack([maps[f"detail.{channel}"][observations.y, observations.x] for channel in "RGB"], axis=-1)
+    detail = np.where(known, detail, 1.0).astype(np.float32)
     normal = np.where(known, normal, observations.normal).astype(np.float32)
-    return msgspec.structs.replace(observations, normal=normal)
+    return msgspec.structs.replace(observations, normal=normal, detail=detail)
 
 
 def _photo_maps(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:

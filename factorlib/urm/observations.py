@@ -63,6 +63,7 @@ class Observations(msgspec.Struct, frozen=True):
     exposures     t·S/N² of each photo from EXIF, None if it is unknown
     confidence    confidence of the normal, 0 to 1
     place         position as in `factorlib.light.distance`
+    detail        factor on the diffuse reflectance
     """
 
     normal: Float[np.ndarray, "n 3"]
@@ -83,6 +84,7 @@ class Observations(msgspec.Struct, frozen=True):
     exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
+    detail: Float[np.ndarray, "n 3"] | None = None  # factor on diffuse reflectance, never written; None: 1
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -94,7 +96,7 @@ class Observations(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray) -> Observations:
         """Select the observations of `rows` (indices or a mask), with the same names."""
-        columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL)}
+        columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL, "detail")}
         selected = {name: values[rows] for name, values in columns.items() if values is not None}
         return msgspec.structs.replace(self, **selected)
 
@@ -216,7 +218,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     fills = {name: (dtype, nothing) for name, (_, dtype, nothing, _) in WIDE.items()}
-    fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0)}
+    fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0), "detail": (np.dtype("f4"), 1)}
     # optional columns: parts without them get full visibility, full confidence, and the origin as place
     for name, (dtype, fill) in fills.items():
         columns = [getattr(part, name) for part in parts]

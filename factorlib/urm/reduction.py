@@ -2,7 +2,7 @@
 
 Merging: Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the
 front). Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
-mean. Normal, view, radiance, place and confidence are averaged, so that the error is second order in the cell's
+mean. Normal, view, radiance, place, confidence and detail are averaged, so that the error is second order in the cell's
 size. Radiance is linear in visibility, so mean visibility belongs to mean radiance. But on a flat seat all points would
 merge into one, and the information of their shadows about the light would be lost. So points merge only if the
 directions hidden from them are similar, by the mean over the sphere of hidden × direction.
@@ -24,6 +24,7 @@ from scipy.sparse import csr_array
 from factorlib.geometry.sphere import direction_cells, fibonacci_sphere, mirror_directions
 from factorlib.urm.observations import Observations
 
+DETAIL_CELL = 0.1  # cell of the logarithm of the reflectance detail
 HIDDEN_CELL = 0.05  # cell of the mean of hidden × direction, which is 1/4 if a whole hemisphere is hidden
 ROWS = 1 << 16  # number of observations whose visibility is in memory as floats
 CELL = np.radians(3.0)  # cell of normals, about the accuracy of poses and meshes
@@ -40,6 +41,8 @@ def merge(observations: Observations, degrees: float) -> Observations:
     mirror = mirror_directions(observations.normal, observations.view)
     flags = observations.clipped @ np.array([1, 2, 4])
     cells = [direction_cells(observations.normal, cell), direction_cells(mirror, 2 * cell)]
+    if observations.detail is not None:
+        cells.append(np.rint(np.log(np.maximum(observations.detail, 1e-3)) / DETAIL_CELL).astype(np.int64))
     if (visibility := observations.visibility) is not None:  # mean of hidden × direction
         directions = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
         chunks = (visibility[i : i + ROWS] for i in range(0, len(visibility), ROWS))
@@ -51,11 +54,11 @@ def merge(observations: Observations, degrees: float) -> Observations:
     total = np.bincount(group, weight)
 
     changed = {"weight": total.astype("f4")}
-    for name in ("normal", "view", "radiance", "place"):
+    for name in ("normal", "view", "radiance", "place", "detail"):
         if (values := getattr(observations, name)) is None:
             continue
         mean = np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
-        length = 1 if name in ("radiance", "place") else np.linalg.norm(mean, axis=-1, keepdims=True)
+        length = 1 if name in ("radiance", "place", "detail") else np.linalg.norm(mean, axis=-1, keepdims=True)
         changed[name] = (mean / length).astype("f4")
     if visibility is not None:
         averaging = csr_array(((weight / total[group]).astype("f4"), (group, np.arange(len(group)))))

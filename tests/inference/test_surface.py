@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
+from scipy.linalg import block_diag
 
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
@@ -19,11 +20,13 @@ from factorlib.inference.surface_turns import (
     LARGEST_TURN,
     LEAST_VIEW_COSINE,
     PULL_SHARE,
+    Detail,
+    Stiffness,
     SurfacePositions,
     Surfaces,
     attach_pixels,
     linearise_light,
-    solve_turns,
+    solve_detail,
 )
 from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
@@ -76,44 +79,48 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
     monkeypatch.setattr(surface_turns, "NORMAL_STEP", 1e-3)  # the step in use smooths what is sharper than a degree
     one, body = photos_in_a_wrong_light(kind), surfaces()
     at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
-    turn = random.normal(size=(body.nodes, 3))
+    turn, log_factor = random.normal(size=(2, body.nodes, 3))
     part = linearise_light(one, COUNTS, PRIOR, at, body.nodes)
     own = light_likelihood(one, COUNTS, PRIOR, True).illumination
     residual = own.block.residuals(own.predict().radiance)
     weight = one.root_weights(residual, FIT_LOSS, COUNTS.temperature)
     after, before = (
-        msgspec.structs.replace(one, block=at.turn_block(one.block, s * turn)).residuals() for s in (1e-3, -1e-3)
+        msgspec.structs.replace(one, block=Detail(s * turn, s * log_factor).apply_to(one.block, at)).residuals()
+        for s in (1e-3, -1e-3)
     )
     inside = np.sum(one.block.normal * one.block.view, 1) > 0.2
-    expected, given = weight * (after - before) / 2e-3, (part.slopes @ turn.reshape(-1)).reshape(-1, 3)
+    both = np.concatenate([turn.reshape(-1), log_factor.reshape(-1)])
+    expected, given = weight * (after - before) / 2e-3, (part.slopes @ both).reshape(-1, 3)
     assert np.abs(expected).max() > 1  # there is something to compare
     error = np.linalg.norm((given - expected)[inside]) / np.linalg.norm(expected[inside])
     assert error < 0.03, error
 
 
-def test_a_step_is_that_of_the_dense_system_of_turns_and_lights(monkeypatch):
-    # the accuracy in use leaves what lights explain as well
+@pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])
+def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monkeypatch):
+    # the accuracy in use leaves what lights explain as well: all factors together
     monkeypatch.setattr(surface_turns, "CG_TOLERANCE", 1e-7)
     monkeypatch.setattr(surface_turns, "CG_ITERATIONS", 2000)
     problem, _, body = *photographed(2, 2, size=9), surfaces(1)
     problem = with_wrong_normals(problem, 0.1)
     fit, random = begun(problem), np.random.default_rng(1)
-    start, stiffness = 0.02 * random.normal(size=(body.nodes, 3)), 50.0
+    start = Detail(0.02 * random.normal(size=(body.nodes, 3)), 0.02 * random.normal(size=(body.nodes, 3)))
     parts = [
         linearise_light(one, COUNTS, PRIOR, attached_to(one.block.normal, body), body.nodes)
         for one in problem.illuminations(fit.point)
     ]
     rough = body.laplacian().toarray() + PULL_SHARE * np.eye(body.nodes)
-    prior = stiffness * np.kron(rough, np.eye(3))
-    before = start.reshape(-1)
-    v = len(before)
+    prior = block_diag(*((a or 0) * np.kron(rough, np.eye(3)) for a in (stiffness.turn, stiffness.factor)))
+    free = np.repeat([stiffness.turn is not None, stiffness.factor is not None], 3 * body.nodes)
+    before = np.concatenate([start.turn.reshape(-1), start.log_factor.reshape(-1)])
+    v, prior = int(free.sum()), prior[np.ix_(free, free)]
     sizes = [one.light.unknowns for one in problem.illuminations(fit.point)]
     system, gradient = np.zeros((v + sum(sizes),) * 2), np.zeros(v + sum(sizes))
-    system[:v, :v], gradient[:v] = prior, prior @ before
+    system[:v, :v], gradient[:v] = prior, prior @ before[free]
     first = v
     for part, one, size in zip(parts, problem.illuminations(fit.point), sizes, strict=True):
         own = slice(first, first + size)
-        J = part.slopes.toarray()
+        J = part.slopes.toarray()[:, free]
         U = np.stack([part.residual_change(e) for e in np.eye(size)], axis=1)
         likelihood = light_likelihood(one, COUNTS, PRIOR, True)
         residual = likelihood.illumination.block.residuals(likelihood.illumination.predict().radiance)
@@ -124,9 +131,12 @@ def test_a_step_is_that_of_the_dense_system_of_turns_and_lights(monkeypatch):
         gradient[:v] += J.T @ r
         gradient[own] = U.T @ r + Q @ u
         first += size
-    expected = before - np.linalg.solve(system, gradient)[:v]
-    given = solve_turns(parts, body.laplacian(), stiffness, start).reshape(-1)
+    expected = before.copy()
+    expected[free] -= np.linalg.solve(system, gradient)[:v]
+    given = solve_detail(parts, body.laplacian(), stiffness, start)
+    given = np.concatenate([given.turn.reshape(-1), given.log_factor.reshape(-1)])
     assert np.linalg.norm(given - expected) < 0.02 * np.linalg.norm(expected - before)
+    assert np.array_equal(given[~free], before[~free])
 
 
 def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
@@ -169,7 +179,7 @@ def errors(normals: np.ndarray, true: np.ndarray) -> float:
 
 def test_dents_that_the_object_has_not_are_found_in_three_lights():
     what, body, given, true = on_spheres(3, 0.15, 1)
-    assert what.evidence.accepted and sum(what.gains.values()) > 0
+    assert what.evidence.accepted and sum(what.gains.values()) > 0 and not what.painted.accepted
     turn = body.turns_from_displacements(what.displacements)
     for block, exact in zip(given.blocks, true.blocks, strict=True):
         at = attached_to(exact.normal, body)
@@ -202,19 +212,28 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
         np.testing.assert_allclose(after[~dented], shown.normal[~dented], atol=1e-12)
 
 
-def test_patina_is_not_taken_for_dents():
+def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     true = [on_even_cells(drawn(k, 120)) for k in range(3)]
     body, problem = surfaces(), spheres(true, size=18)
+    (one,) = body.meshes.values()
+    log_factor = 0.4 * np.sin(4 * one.mesh.vertices[:, 0]) * np.cos(3 * one.mesh.vertices[:, 1] + 1)
+    log_factor = log_factor[:, None] * [1.0, 0.8, -0.5]
+    painted = Detail(np.zeros((body.nodes, 3)), log_factor)
     at = [attached_to(block.normal, body) for block in problem.blocks]
+    clean = problem.with_blocks(
+        [msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks]
+    )
     point = Point(MATERIALS, in_units_of(problem.blocks, true))
-    blocks = []
-    for block, one in zip(problem.blocks, problem.illuminations(point), strict=True):
-        x, prediction = block.normal @ TURN, one.predict()
-        factor = np.exp(0.4 * (np.sin(4 * x[:, :1]) * np.cos(3 * x[:, 1:2] + 1)) * [1.0, 0.8, -0.5])
-        painted = prediction.radiance + (factor - 1) * one.materials.diffuse[block.material] * prediction.diffuse
-        share = painted / np.maximum(prediction.radiance, 1e-9)
-        blocks.append(msgspec.structs.replace(block, radiance=block.radiance * share))
-    assert not estimate_surface(problem.with_blocks(blocks), body, at, start_from_photos(3)).evidence.accepted
+    shown = clean.with_blocks([painted.apply_to(b, a) for b, a in zip(clean.blocks, at, strict=True)]).radiance(point)
+    plain = clean.radiance(point)
+    blocks = [
+        msgspec.structs.replace(b, radiance=b.radiance * y / np.maximum(x, 1e-9))
+        for b, x, y in zip(problem.blocks, plain, shown, strict=True)
+    ]
+    what = estimate_surface(problem.with_blocks(blocks), body, at, start_from_photos(3))
+    assert what.painted.accepted
+    seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
+    assert min(np.corrcoef(what.log_factors["ball"][seen, c], log_factor[seen, c])[0, 1] for c in range(3)) > 0.8
 
 
 def sharp(seed: int):

@@ -1,16 +1,22 @@
 """The files of `surface`, and what later stages make of them."""
 
+import json
+
 import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import MeshEntry
+from factorlib.export.gltf_writer import write_glb
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_exr
+from factorlib.inference.blocks import Noise
+from factorlib.inference.observed import blocks_of_observations, gather_observations
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
+from factorlib.results.materials import Reflectance
 from factorlib.results.surface_table import SurfaceTable, read_surface
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs, serial_map, silent
 from factorlib.urm.extract import read_geometry, with_surface_normals
 from factorlib.urm.observations import Observations, read_observations, write_observations
 from stages import surface
@@ -29,28 +35,35 @@ def observations() -> Observations:
 
 
 def written(folder) -> None:
-    """A surface that leans to the right; its first row shows no mesh."""
+    """A surface that leans to the right and is half as bright on its left half; its first row shows no mesh."""
     normal = np.tile([0.6, 0.0, -0.8], (SIZE, SIZE, 1))
     normal[0] = 0
-    channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")}
+    detail = np.where(np.arange(SIZE) < SIZE // 2, 0.5, 1.0) * np.ones((SIZE, 1))
+    channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {f"detail.{c}": detail for c in "RGB"}
     (folder / "photos").mkdir(parents=True)
     write_exr(folder / "photos" / "a.exr", channels)
 
 
-def test_observations_and_maps_have_the_normals_of_the_surface(tmp_path):
+def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tmp_path):
     written(tmp_path / "surface")
     observed = with_surface_normals(observations(), tmp_path / "surface")
     first = observed.y == 0
     np.testing.assert_allclose(observed.normal[~first], np.tile([0.6, 0, -0.8], ((~first).sum(), 1)), atol=1e-6)
-    assert (observed.normal[first] == [0, 0, -1]).all()
+    assert (observed.normal[first] == [0, 0, -1]).all() and (observed.detail[first] == 1).all()
+    assert (observed.detail[~first & (observed.x < 6)] == 0.5).all() and (observed.detail[observed.x >= 6] == 1).all()
     (tmp_path / "align").mkdir()
     write_exr(
         tmp_path / "align" / "a.exr",
         {f"normal.{a}": np.ones((SIZE, SIZE)) for a in "xyz"} | {"depth": np.ones((SIZE, SIZE))},
     )
     maps = read_geometry(tmp_path / "align", tmp_path / "surface", "a")
-    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth"}
+    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", *(f"detail.{c}" for c in "RGB")}
     assert maps["normal.x"][3, 3] == np.float32(0.6)
+    assert "detail.R" not in read_geometry(tmp_path / "align", None, "a")
+    assert (
+        with_surface_normals(observations(), None) is not None
+        and with_surface_normals(observations(), None).detail is None
+    )
     wide = msgspec.structs.replace(observations(), x=observations().x + 1)
     refusal("12 × 12", with_surface_normals, wide, tmp_path / "surface")
 
@@ -62,6 +75,17 @@ def test_all_choices_of_materials_of_a_textured_mesh_have_the_same_faces(tmp_pat
     read = MeshCache(lambda _, file: tmp_path / file, ["red", "blue"], CREASE_DEG, textures=textures)
     red, blue = (read.mesh("ball", MeshEntry("ball.ply", material="red"), {"ball": m}) for m in ("red", "blue"))
     assert np.array_equal(red.faces, blue.faces) and np.unique(red.detail) == 0.5 and blue.detail is None
+
+
+def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(tmp_path):
+    written(tmp_path / "surface")
+    write_observations(tmp_path / "a.parquet", observations())
+    (photo,) = gather_observations([tmp_path / "a.parquet"], 2.0, serial_map, tmp_path / "surface")
+    assert np.unique(photo.merged.detail).tolist() == [0.5, 1.0]
+    (block,) = blocks_of_observations(photo.merged, Noise())
+    assert np.array_equal(np.sort(block.detail, 0), np.sort(photo.merged.detail, 0))
+    plain = msgspec.structs.replace(photo.merged, detail=None)
+    assert blocks_of_observations(plain, Noise())[0].detail is None
 
 
 def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
@@ -83,16 +107,22 @@ def test_a_held_out_photo_takes_no_part_whatever_it_shows(tmp_path):
     assert results[0] == results[1]
 
 
-def test_meshes_are_moved_wherever_they_are_read(tmp_path):
+def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     write_ply(tmp_path / "ball.ply", sphere(1.0))
     dense = subdivided_mesh(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
-    moves = {"ball": np.full(dense.nodes, 0.05).tolist()}
-    once = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, moves)
+    moves, factors = ({"ball": np.full(shape, 0.05).tolist()} for shape in (dense.nodes, (dense.nodes, 3)))
+    once = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, moves, factors)
     mesh = once.mesh("ball", MeshEntry("ball.ply", material="red"))
     radius = np.linalg.norm(mesh.vertices, axis=1).max()
-    assert abs(radius - 1 - 0.05 * dense.extent) < 1e-3
+    assert abs(radius - 1 - 0.05 * dense.extent) < 1e-3 and np.allclose(mesh.detail, np.exp(0.05))
     write_ply(tmp_path / "moved.ply", mesh)
     again = read_mesh(tmp_path / "moved.ply", ["red"], "red")
     assert np.isclose(np.linalg.norm(again.vertices, axis=1).max(), radius)
+    write_glb(tmp_path / "moved.glb", mesh, ["red"], {"red": Reflectance([0.2, 0.1, 0.1], [0.0] * 3, 0.5)})
+    data = (tmp_path / "moved.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert "TEXCOORD_0" in tree["meshes"][0]["primitives"][0]["attributes"]
+    base = tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
+    np.testing.assert_allclose(base[:3], np.exp(0.05) * np.array([0.2, 0.1, 0.1]), rtol=1e-6)
     other = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
     refusal("surface", other.mesh, "ball", MeshEntry("ball.ply", material="red"))
