@@ -5,12 +5,13 @@ prior: stone becomes enamel.  Once the errors of the model are known (`factorlib
 is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, S its covariance by the observations alone, and
 M that of the errors of the model.  p is the mixture of classes of `factorlib.inference.material_prior`.  θ minimises
 
-    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(θ),    θ₀ = θ̂ + S g                                     (1)
+    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + S g                                     (1)
 
 with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior, and θ₀ is the estimate of the observations
-without it.  So without errors of the model (M = 0) θ̂ stays.  S couples k_d to k_s, so k_d follows.  The covariance is
-((S + M)⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one less
-the ratio of its variance to that in S + M.
+without it.  So without errors of the model (M = 0) θ̂ stays.  S couples k_d to k_s, so k_d follows.  The covariance
+is ((S + M)⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one
+less the ratio of its variance to that in S + M.  The fit alone uses ε of the mixture: its pull on well determined
+sums of k_d and k_s would count as much as the errors of the model.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from factorlib.inference.material_prior import TINTS, Mixture, classes_of
+from factorlib.inference.material_prior import Mixture, classes_of
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 
 BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
@@ -63,7 +64,7 @@ def material_posterior(
     deviation = np.where(free, np.sqrt(np.diag(covariance) + model_error**2), 0.0)
     if not free[3:].any():
         return MaterialPosterior(fitted, deviation, np.zeros(7))
-    mixture = Mixture(classes_of(name))
+    mixture = Mixture(classes_of(name), one_tint=False)
     limited, center = without_prior(fitted, covariance, free, mixture)
     limited += np.diag(model_error**2)
     precision = np.linalg.inv(limited[np.ix_(free, free)])
@@ -77,15 +78,11 @@ def material_posterior(
         energy, slope, _, _ = mixture.evaluate(full)
         return float(off @ precision @ off) + energy, 2 * (precision @ off + slope[free])
 
-    # (1) has several minima: one start is the fit, the others have the means of the classes and one tint or none
-    tint, grey = TINTS @ fitted[:3], np.full(3, fitted[:3].mean())
+    # (1) has several minima.  One start is the fit; the others have the means of the classes, where errors of the model
+    # exceed those of the observations, whose quadratic form holds near the fit only.
     starts = [fitted]
-    for mean in mixture.mean:
-        starts += [
-            np.append(fitted[:3], mean),
-            np.append(grey, mean),
-            np.append(fitted[:3], mean + np.append(tint, 0.0)),
-        ]
+    if (model_error**2 > np.diag(covariance))[3:].any():
+        starts += [np.append(fitted[:3], mean) for mean in mixture.mean]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x
@@ -93,7 +90,7 @@ def material_posterior(
     variance = np.zeros(7)
     variance[free] = np.diag(np.linalg.inv(precision + by_prior[np.ix_(free, free)]))
     share = np.where(free, 1 - variance / np.diag(limited), 0.0).clip(0, 1)
-    # the prior says little of k_d, whose deviation is therefore not limited
+    # no prior bears on k_d, whose deviation is therefore not limited
     posterior_deviation = np.where(np.arange(7) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))
     return MaterialPosterior(result, posterior_deviation, share)
 

@@ -123,10 +123,15 @@ class Mixture:
         classes: The classes.
         relative: Standard deviation that is added to those of logarithms, in quadrature.
         rough: Standard deviation that is added to that of roughness, in quadrature.
+        one_tint: False to leave out ε.
     """
 
     def __init__(
-        self, classes: Sequence[MaterialClass], relative: float = 0.0, rough: float = CLASS_ROUGHNESS_DEVIATION
+        self,
+        classes: Sequence[MaterialClass],
+        relative: float = 0.0,
+        rough: float = CLASS_ROUGHNESS_DEVIATION,
+        one_tint: bool = True,
     ):
         self.names = [material_class.name for material_class in classes]
         slack = np.diag([SCALE_DEVIATION**2 + relative**2, rough**2])
@@ -136,7 +141,7 @@ class Mixture:
         # τ², and 1/ε² of each class
         noise = WHITE_DEVIATION**2 + relative**2
         tints = np.array([material_class.tint**2 + noise for material_class in classes])
-        differences = [material_class.tint_difference for material_class in classes]
+        differences = [material_class.tint_difference if one_tint else None for material_class in classes]
         self.difference = np.array([0.0 if each is None else 1 / (each**2 + noise) for each in differences])
         # precision of (log k_s, roughness), [4, 4] a class, but for e
         for P, covariance, variance in zip(self.precision, covariances, tints, strict=True):

@@ -155,14 +155,17 @@ class Posterior:
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
+        # the residuals of noise alone have a deviation of 1: what exceeds it gives the prior its say
+        noise = min(deviation, 1.0)
+        excess = np.sqrt(deviation**2 - noise**2)
         posteriors = []
         for m, theta in enumerate(unknowns):
             rows = slice(7 * m, 7 * m + 7)
             by_logs = covariance[rows, rows] / np.outer(values[m], values[m])
             name = self.problem.known.classes.get(m)
-            posteriors.append(material_posterior(theta, by_logs, deviation * MODEL_ERROR, free[m], name))
+            posteriors.append(material_posterior(theta, by_logs, excess * MODEL_ERROR, free[m], name))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
-        deviations = np.array([posterior.deviation for posterior in posteriors])
+        deviations = np.hypot([posterior.deviation for posterior in posteriors], free * noise * MODEL_ERROR)
         errors = np.minimum(deviations * by_unknowns(materials), WIDTHS)
         shares = np.array([posterior.prior_share for posterior in posteriors])
         return materials, MaterialErrors(Materials.from_rows(errors), deviation, shares)
