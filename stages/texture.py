@@ -41,6 +41,7 @@ CLUSTER_PIXELS = 16  # side of the blocks of pixels whose residuals are correlat
 DETAIL = ("detail.R", "detail.G", "detail.B")
 # Edge of the trial's meshes, in units of their extent, and its step between rows and columns of pixels.
 TRIAL_EDGE, TRIAL_STEP = 0.02, 2
+TRIAL_GAIN = 0.03  # share of the loss by which a trial has to be better than a flat colour
 Key = tuple[str, str]  # names of a mesh and of a material
 Factors = dict[Key, Float[np.ndarray, "v 3"]]
 
@@ -50,6 +51,12 @@ class Estimate(NamedTuple):
 
     factor: Float[np.ndarray, "v 3"] | None
     evidence: TextureEvidence
+
+    @property
+    def promising(self) -> bool:
+        """True if photos are predicted better than by a flat colour, by TRIAL_GAIN of the loss."""
+        with_texture, flat = self.evidence.by.held_out_loss_with, self.evidence.by.held_out_loss_without
+        return with_texture is not None and flat is not None and with_texture < (1 - TRIAL_GAIN) * flat
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -84,7 +91,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     # a coarse trial, then the promising ones at the photos' resolution
     coarse = {name: subdivided_mesh(mesh, TRIAL_EDGE) for name, mesh in meshes.items()}
     estimates = solved.estimate(coarse, None, TRIAL_STEP)
-    promising = {key for key, trial in estimates.items() if (trial.evidence.by.margin or 0.0) > 0}
+    promising = {key for key, trial in estimates.items() if trial.promising}
     visible = [name for name in meshes if any(mesh == name for mesh, _ in promising)]
     longest = {name: longest_edge(name, meshes[name], photos, params.edge) for name in visible}
     fine = {name: subdivided_mesh(meshes[name], edge) for name, edge in longest.items()}
