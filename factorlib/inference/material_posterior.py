@@ -78,11 +78,9 @@ def material_posterior(
         energy, slope, _, _ = mixture.evaluate(full)
         return float(off @ precision @ off) + energy, 2 * (precision @ off + slope[free])
 
-    # (1) has several minima.  One start is the fit; the others have the means of the classes, where errors of the model
-    # exceed those of the observations, whose quadratic form holds near the fit only.
-    starts = [fitted]
-    if (model_error**2 > np.diag(covariance))[3:].any():
-        starts += [np.append(fitted[:3], mean) for mean in mixture.mean]
+    # (1) has several minima.  S holds near the fit, one start; means of classes are others where M exceeds S
+    far = (model_error**2 > np.diag(covariance))[3:].any()
+    starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean if far)]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x

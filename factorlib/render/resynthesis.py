@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_closing
-from scipy.sparse import csr_array, eye_array
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -240,22 +240,24 @@ def resynthesise_parts(
         normals, views = (_unit(vectors[pixels].astype(float)) for vectors in (normal, view))
         y, x = np.nonzero(pixels)
         visibility, bounced, place = nearest_surroundings(surroundings, k - 1, y, x)
-        # the operator at some pixels, interpolation elsewhere
         nodes, weights = interpolation_nodes(pixels, normals, views, material.roughness**2)
         effects = PointEffects(*(None if values is None else values[nodes] for values in (visibility, place)))
         at_nodes = reflector.parts(material, normals[nodes], views[nodes], report_pixels, effects)
         radiance = np.stack([weights @ part for part in at_nodes])
-        # radiance of bounces: k_d G_d + k_s G_s
         if bounced is not None:
             facing = np.sum(normals * views, 1, keepdims=True) > 0
-            radiance[0] += np.array(material.diffuse) * bounced[:, :3] * facing
-            radiance[1] += np.array(material.specular) * bounced[:, 3:] * facing
+            radiance += reflect_bounces(material, bounced) * facing
         if "detail.R" in geometry:
             radiance[0] *= np.stack([geometry[f"detail.{channel}"][pixels] for channel in "RGB"], axis=-1)
         pictures[:, pixels] = radiance
         before += int(pixels.sum())
         report_pixels(0, 0)
     return pictures
+
+
+def reflect_bounces(material: Reflectance, bounced: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "2 n 3"]:
+    """Return the diffuse and the specular radiance of bounces, k_d G_d and k_s G_s."""
+    return np.stack([np.array(material.diffuse) * bounced[:, :3], np.array(material.specular) * bounced[:, 3:]])
 
 
 def interpolation_nodes(
@@ -285,8 +287,6 @@ def interpolation_nodes(
     corners = np.stack([number[top + i, left + j] for i in (0, GRID) for j in (0, GRID)], axis=1)
     shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=1)
     rows = np.flatnonzero((corners >= 0).all(1))
-    if not len(rows):
-        return np.arange(len(y)), eye_array(len(y), format="csr")
     at_corners = normals[corners[rows]]
     spread = np.linalg.norm(at_corners - at_corners[:, :1], axis=-1).max(1)
     error = np.linalg.norm(_unit(np.einsum("nk,nkc->nc", shares[rows], at_corners)) - normals[rows], axis=-1)
