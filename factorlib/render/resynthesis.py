@@ -238,8 +238,7 @@ def resynthesise_parts(
     for k, material in enumerate(materials, start=1):
         pixels = label == k
         normals, views = (_unit(vectors[pixels].astype(float)) for vectors in (normal, view))
-        y, x = np.nonzero(pixels)
-        visibility, bounced, place = nearest_surroundings(surroundings, k - 1, y, x)
+        visibility, bounced, place = nearest_surroundings(surroundings, k - 1, *np.nonzero(pixels))
         nodes, weights = interpolation_nodes(pixels, normals, views, material.roughness**2)
         effects = PointEffects(*(None if values is None else values[nodes] for values in (visibility, place)))
         at_nodes = reflector.parts(material, normals[nodes], views[nodes], report_pixels, effects)
