@@ -26,8 +26,8 @@ from factorlib.light.lobes import lobe_energy
 
 DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is observed whole
 SHARPEST = 350.0  # largest λ of a kernel, about as wide as a texel
-# Least share of the sphere that a photo shows.  A long lens shows little but what is straight behind the objects: the
-# black cloth of a studio, or a sky.  That says nothing of the light, and yet it would fix the scale of reflectances.
+# Least share of the sphere that the background of a photo covers.  A long lens shows only what is straight behind the
+# objects, such as black cloth or sky.  This says nothing of the light, but would fix the scale of reflectances.
 LEAST_COVERAGE = 0.05
 LEAST_RADIANCE = 1e-3  # least radiance of a cell, in units of the block
 
@@ -71,7 +71,7 @@ class Background(msgspec.Struct, frozen=True):
 
 
 def concatenate_backgrounds(backgrounds: list[Background]) -> Background | None:
-    """Return the background of several photos, without those that show less than LEAST_COVERAGE; None without any."""
+    """Return the background of all photos that cover more than LEAST_COVERAGE; None if there is none."""
     wide = [background for background in backgrounds if background.solid_angle.sum() > LEAST_COVERAGE * 4 * np.pi]
     if not wide:
         return None

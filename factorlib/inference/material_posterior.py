@@ -10,8 +10,8 @@ M that of the errors of the model.  p is the mixture of classes of `factorlib.in
 with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior, and θ₀ is the estimate of the observations
 without it.  So without errors of the model (M = 0) θ̂ stays.  S couples k_d to k_s, so k_d follows.  The covariance
 is ((S + M)⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one
-less the ratio of its variance to that in S + M.  The fit alone uses ε of the mixture: its pull on well determined
-sums of k_d and k_s would count as much as the errors of the model.
+less the ratio of its variance to that in S + M.  The mixture is without ε, which is a term of the fit.  Here it would
+move sums of k_d and k_s that the observations determine.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def material_posterior(
         energy, slope, _, _ = mixture.evaluate(full)
         return float(off @ precision @ off) + energy, 2 * (precision @ off + slope[free])
 
-    # (1) has several minima.  S holds near the fit, one start; means of classes are others where M exceeds S
+    # (1) has several minima.  S is valid near the fit only, so classes are other starts only where M exceeds S
     far = (model_error**2 > np.diag(covariance))[3:].any()
     starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean if far)]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]

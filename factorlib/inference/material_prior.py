@@ -166,7 +166,7 @@ class Mixture:
         # e and its Jacobian by log k_d and log k_s
         share = 1 / (1 + np.exp(theta[3:6] - theta[:3]))  # k_d/(k_d + k_s)
         e = -TINTS @ np.logaddexp(0, theta[:3] - theta[3:6])
-        J = TINTS * share @ np.hstack([-np.eye(3), np.eye(3)])
+        J = (TINTS * share) @ np.hstack([-np.eye(3), np.eye(3)])
         energy = energy + self.difference * (e @ e)
         least = energy.min()
         odds = np.exp(-(energy - least) / 2)

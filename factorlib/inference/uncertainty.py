@@ -155,7 +155,7 @@ class Posterior:
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
-        # the residuals of noise alone have a deviation of 1: what exceeds it gives the prior its say
+        # residuals of noise alone have a deviation of 1; only the excess is an error of the model
         noise = min(deviation, 1.0)
         excess = np.sqrt(deviation**2 - noise**2)
         posteriors = []

@@ -148,10 +148,10 @@ class Reflector:
 
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-# Spacing of the pixels that are evaluated on smooth surfaces, and the largest differences of normals there, in α.
-GRID = 3
-SPREAD = 0.5
-ERROR = 0.1
+GRID = 3  # spacing of the pixels that are evaluated on smooth surfaces
+# Largest differences of normals there, in α: between four nodes, and from their interpolation.
+LARGEST_SPREAD = 0.5
+LARGEST_ERROR = 0.1
 STEP = 0.55  # spacing of nodes on a ball, in α
 LONGEST_STEP = 0.1  # largest spacing of nodes, radians
 NARROW = 1000.0  # sharpness above which a spline does not follow a lobe's highlight
@@ -264,9 +264,10 @@ def interpolation_nodes(
 ) -> tuple[Int[np.ndarray, " m"], csr_array]:
     """Select the pixels that the operator is evaluated at, and the weights that interpolate the others.
 
-    The nodes of a grid of GRID pixels are evaluated.  A pixel between them is interpolated bilinearly if it lies among
-    four nodes of the mask, whose normals differ by less than SPREAD α, and its normal is by less than ERROR α that of
-    the interpolation: a highlight, of width α, is smooth there.  All other pixels are evaluated.
+    The nodes of a grid of GRID pixels are evaluated.  A pixel between them is interpolated bilinearly if three things
+    hold: its four nodes lie in the mask and face the viewer, their normals differ by less than LARGEST_SPREAD α, and
+    its own normal differs from the interpolated one by less than LARGEST_ERROR α.  Highlights, of width α, are then
+    smooth.  All other pixels are evaluated.
 
     Args:
         pixels: mask of n pixels
@@ -290,7 +291,7 @@ def interpolation_nodes(
     spread = np.linalg.norm(at_corners - at_corners[:, :1], axis=-1).max(1)
     error = np.linalg.norm(_unit(np.einsum("nk,nkc->nc", shares[rows], at_corners)) - normals[rows], axis=-1)
     facing = np.einsum("nkc,nc->nk", at_corners, views[rows]).min(1) > 0
-    smooth = rows[(spread < SPREAD * alpha) & (error < ERROR * alpha) & facing]
+    smooth = rows[(spread < LARGEST_SPREAD * alpha) & (error < LARGEST_ERROR * alpha) & facing]
     # grid nodes have a weight of 1 at themselves
     evaluated = np.ones(len(y), bool)
     evaluated[smooth] = (y[smooth] % GRID == 0) & (x[smooth] % GRID == 0)

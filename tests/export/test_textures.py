@@ -19,7 +19,7 @@ from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.meshes.read_mesh import read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.results.materials import Reflectance, read_materials
-from factorlib.results.surface_table import FILE, SurfaceTable
+from factorlib.results.texture_table import FACTORS, FILE, TextureTable, write_factors
 from factorlib.stage import silent
 from stages import export
 from tests.export import made_export
@@ -89,10 +89,11 @@ def folder(tmp_path_factory):
     inputs = made_export.make(root)
     dense = subdivided_mesh(read_mesh(inputs.files["egg.obj"], made_export.NAMES, made_export.PARTS["egg"]))
     nodes = np.zeros((dense.nodes, 3))
-    nodes[dense.node] = np.log(waves(dense.mesh.vertices))
-    (root / "surface").mkdir()
-    write_json(root / "surface" / FILE, SurfaceTable(painted=True, log_factors={"egg": nodes.tolist()}))
-    inputs = msgspec.structs.replace(inputs, folders={**inputs.folders, "surface": root / "surface"})
+    nodes[dense.node] = waves(dense.mesh.vertices)
+    (root / "texture").mkdir()
+    write_json(root / "texture" / FILE, TextureTable({"egg": 0.04}))
+    write_factors(root / "texture" / FACTORS, {("egg", name): nodes for name in ("red", "brass")})
+    inputs = msgspec.structs.replace(inputs, folders={**inputs.folders, "texture": root / "texture"})
     for name in ("export", "again"):
         (root / name).mkdir()
         export.main(export.Params(height=32, mitsuba_height=32), inputs, root / name, silent)

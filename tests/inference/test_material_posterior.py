@@ -59,6 +59,7 @@ def test_where_the_model_is_wrong_the_material_is_a_likely_one():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_point_of_a_search_has_less_energy(seed):
+    """Where errors of the model exceed those of the observations."""
     random = np.random.default_rng(seed)
     sigma, errors = random_covariance(seed), np.array([0.1] * 3 + [1.0] * 3 + [0.3])
     posterior = material_posterior(ENAMEL, sigma, errors, ALL)

@@ -222,7 +222,7 @@ def test_interpolated_pixels_are_those_that_the_operator_gives(roughness, share,
     parts = reflector.parts
     monkeypatch.setattr(reflector, "parts", lambda m, n, *rest: evaluated.append(len(n)) or parts(m, n, *rest))
     fast = resynthesise(reflector, [material], photo, geometry)
-    monkeypatch.setattr(resynthesis, "SPREAD", 0.0)
+    monkeypatch.setattr(resynthesis, "LARGEST_SPREAD", 0.0)
     exact = resynthesise(reflector, [material], photo, geometry)
     assert evaluated[1] == photo["label"].sum() >= evaluated[0] / share
     assert np.sqrt(np.mean((fast - exact) ** 2)) < 0.005 * np.sqrt(np.mean(exact**2))
@@ -237,18 +237,30 @@ def test_detail_is_a_factor_on_the_diffuse_part_alone():
     np.testing.assert_allclose(result, plain * [detail, np.ones_like(detail)], rtol=1e-9)
 
 
-def test_nothing_is_interpolated_across_an_edge_nor_over_rough_normals():
-    """Of two planes, and of random normals."""
-    pixels = np.ones((30, 30), bool)
-    bent = np.where(np.arange(900)[:, None] % 30 < 14, unit(1, 0), unit(1, 1))
-    bent *= np.sign(bent @ FRONT)[:, None]
-    views = np.tile(FRONT, (900, 1))
-    nodes, weights = interpolation_nodes(pixels, bent, views, 0.1)
-    assert 100 <= len(nodes) < 350
-    np.testing.assert_allclose(weights @ bent[nodes], bent, atol=1e-12)
-    rough = unit(900, 2)
-    nodes, weights = interpolation_nodes(pixels, rough, rough, 0.1)
-    assert len(nodes) == 900 and (weights @ rough == rough).all()
+def evaluated(normals: np.ndarray, toward: np.ndarray = FRONT) -> np.ndarray:
+    """Mask of the pixels of a square picture that are evaluated, for a material of α = 0.1."""
+    size = len(normals)
+    flat = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(-1, 3)
+    nodes, weights = interpolation_nodes(np.ones((size, size), bool), flat, np.tile(toward, (size**2, 1)), 0.1)
+    np.testing.assert_allclose(weights @ flat[nodes], flat, atol=0.01)
+    return np.isin(np.arange(size**2), nodes).reshape(size, size)
+
+
+@pytest.mark.parametrize("slope, all_of_them", [(0.005, False), (0.03, True)])
+def test_pixels_of_a_surface_that_bends_in_the_width_of_a_highlight_are_all_evaluated(slope, all_of_them):
+    normals = np.tile(FRONT, (31, 31, 1)) + slope * np.arange(31)[:, None, None] * [1, 0, 0]
+    assert evaluated(normals)[:30, :30].all() == all_of_them
+
+
+@pytest.mark.parametrize("bump, count", [(0.005, 100), (0.02, 101)])
+def test_a_pixel_of_another_normal_than_its_neighbours_is_evaluated(bump, count):
+    normals = np.tile(FRONT, (31, 31, 1))
+    normals[13, 17] += [bump, 0, 0]
+    assert evaluated(normals)[:30, :30].sum() == count
+
+
+def test_nothing_is_interpolated_that_faces_away_nor_over_rough_normals():
+    assert evaluated(np.tile(FRONT, (31, 31, 1)), -FRONT).all() and evaluated(unit(900, 2).reshape(30, 30, 3)).all()
 
 
 @pytest.mark.parametrize("lit, facing", [(no_lobes(), 1), (light().scale(0.0), 1), (light(), -1)])
