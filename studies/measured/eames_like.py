@@ -19,26 +19,29 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from factorlib.errors import InputError
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images.exr import read_rgb_exr
 from factorlib.images.light_map import maps_in
 from factorlib.jsonfile import write_json
-from studies.measured.light_prior import prior_of
-from studies.measured.standard_errors import light_deviations, material_deviations
+from studies.measured.light_prior import cell_means, prior_of
+from studies.measured.standard_errors import CELLS, light_deviations, material_deviations
 from studies.measured.tools import ROOT, Tables, evaluate_dataset, value_at
 
 PLACE = ROOT / "build/bench/eames-like"
-SEEDS = (101, 102, 103, 104, 105)
-CAPTURED_SEEDS = (106, 107, 108, 109, 110)
+SEEDS = (161, 162, 163, 164, 165)
+CAPTURED_SEEDS = (166, 167, 168, 169, 170)
 MAPS = 6  # of a set: one for each photo
 PRIOR = Path("factorlib/light/prior.json")
 COPIED = ("factorlib", "stages", "recipes", "pipeline.yaml")
 DEVIATIONS = ("k_d", "k_s", "roughness", "log radiance of lights")
+FIFTHS = ("darkest", "second", "third", "fourth", "brightest")  # of directions, by estimated radiance
 LIGHT = "light.mean.channel_per_photo"
 BALLS = "relighting.mean.channel_per_photo"
 PSNR = "psnr_tonemapped_db"
@@ -106,6 +109,30 @@ class SetResult(NamedTuple):
     def deviations(self) -> list[np.ndarray]:
         """Return |estimate − truth| over the standard error, in the order of `DEVIATIONS`."""
         return [*material_deviations(self.build).values(), light_deviations(self.build)]
+
+    def lights(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield each light and the true one, in `CELLS` cells, in the gauge of the relit set score."""
+        cells, factor = fibonacci_sphere(CELLS), np.array(self.metrics["relit_set"]["factor"])
+        for path in sorted((self.build / "evaluate/illumination").glob("*.exr")):
+            true = cell_means(read_rgb_exr(path), cells)
+            yield cell_means(read_rgb_exr(self.build / "export/illumination" / path.name), cells) / factor, true
+
+    def fifths(self) -> np.ndarray:
+        """Return estimated over true radiance of the `FIFTHS`, over all lights, each relative to its true mean."""
+        sums = np.zeros((2, len(FIFTHS)))
+        for light, true in self.lights():
+            parts = np.array_split(light.sum(1).argsort(), len(FIFTHS))
+            sums += [[radiance[part].sum() / true.mean() for part in parts] for radiance in (light, true)]
+        return sums[0] / sums[1]
+
+    def chroma(self) -> tuple[float, float]:
+        """Return the RMS error of the logarithm of lights' chroma, and that of the true light's mean chroma."""
+        errors, nulls = [], []
+        for light, true in self.lights():
+            tints = [np.log(np.maximum(each, 1e-6 * true.mean())) @ (np.eye(3) - 1 / 3) for each in (light, true)]
+            errors.append(tints[0] - tints[1])
+            nulls.append(tints[1] - tints[1].mean(0))
+        return float(np.sqrt(np.square(errors).mean())), float(np.sqrt(np.square(nulls).mean()))
 
 
 def generate_set(seed: int, lights: Path | None = None) -> Path:
@@ -196,6 +223,12 @@ def rows_of(results: Sequence[SetResult]) -> list[list[str]]:
             brackets = [quantity.text(null) for null in [*nulls, np.mean(nulls[1:])]]
             cells = [f"{cell} ({null})" for cell, null in zip(cells, brackets, strict=True)]
         table.append([quantity.meaning, *cells])
+    for name, *ratios in zip(FIFTHS, *(result.fifths() for result in results), strict=True):
+        cells = [f"{ratio:.2f}" for ratio in [*ratios, np.mean(ratios[1:])]]
+        table.append([f"{name} fifth of directions, estimated over true radiance", *cells])
+    pairs = [result.chroma() for result in results]
+    pairs.append(tuple(np.mean(pairs[1:], axis=0)))
+    table.append(["chroma of lights, log", *(f"{error:.3f} ({null:.3f})" for error, null in pairs)])
     for name, *columns in zip(DEVIATIONS, *(result.deviations() for result in results), strict=True):
         shares = [f"{100 * np.mean(column < 1):.0f} %" for column in [*columns, np.concatenate(columns[1:])]]
         table.append([f"{name} within one standard error", *shares])
