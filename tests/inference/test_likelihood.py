@@ -295,13 +295,13 @@ def test_the_gradient_is_the_finite_difference_of_the_value(seed):
 
 def test_the_density_is_one_altogether():
     """Over the level of k_s, its tint and the roughness, where k_d is 0: the sum on a grid."""
-    level, roughness, tint = np.arange(-9, 4, 0.8), np.arange(-2.5, 4, 0.3), np.arange(-1.6, 1.61, 0.2)
+    level, roughness, tint = np.arange(-9, 4, 1.0), np.arange(-1.5, 3, 0.35), np.arange(-1.6, 1.61, 0.2)
     mixture, across = Mixture(shipped_classes().classes), np.array([[1, -1, 0], [1, 1, -2]]) / np.sqrt([[2], [6]])
     grid = np.array(np.meshgrid(level, tint, tint, roughness)).reshape(4, -1).T
     black = np.full((len(grid), 3), -30.0)
     points = np.column_stack([black, grid[:, :1] + grid[:, 1:3] @ across, grid[:, 3]])
     total = sum(np.exp(-mixture.evaluate(point)[0] / 2) for point in points)
-    assert total * 0.8 * 0.3 * 0.2**2 / (2 * np.pi) ** 2 == pytest.approx(1, rel=0.02)
+    assert total * 1.0 * 0.35 * 0.2**2 / (2 * np.pi) ** 2 == pytest.approx(1, rel=0.02)
 
 
 @pytest.mark.parametrize("material, name", [(PLASTIC, "dielectric"), (GOLD, "metal"), (FELT, "fabric")])

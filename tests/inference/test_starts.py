@@ -201,6 +201,7 @@ def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
 
 CHOICES = SolveOptions(cells=24, splittings=1, observations=100)
 PARTS = ("effects", "tone", "distances", "materials", "splitting", "prior", "lights", "suns")
+SHORT = ("materials", "lights")  # of PARTS, those that make test kills after
 ALL = (*PHASES, "splitting 1", "prior", "lights", "suns")
 
 
@@ -271,7 +272,7 @@ class Fragile(Checkpoint):
             raise Killed
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", [pytest.param(p, marks=[pytest.mark.long] * (p not in SHORT)) for p in PARTS])
 def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp_path, part):
     path = tmp_path / "solve.pt"
     with pytest.raises(Killed):

@@ -160,7 +160,7 @@ def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
 def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[SurfaceEstimate, Surfaces, JointProblem, JointProblem]:
     """What is found of a ball whose mesh has dents of that size, in so many lights."""
     true = [on_even_cells(drawn(100 * seed + k, 120)) for k in range(lights)]
-    problem, body = spheres(true, size=18, seed=seed), surfaces()
+    problem, body = spheres(true, size=13, seed=seed), surfaces()
     given = with_wrong_normals(problem, size)
     at = [attached_to(block.normal, body) for block in problem.blocks]
     progress = Rising()
@@ -214,7 +214,7 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
 
 def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     true = [on_even_cells(drawn(k, 120)) for k in range(3)]
-    body, problem = surfaces(), spheres(true, size=18)
+    body, problem = surfaces(), spheres(true, size=13)
     (one,) = body.meshes.values()
     log_factor = 0.4 * np.sin(4 * one.mesh.vertices[:, 0]) * np.cos(3 * one.mesh.vertices[:, 1] + 1)
     log_factor = log_factor[:, None] * [1.0, 0.8, -0.5]

@@ -245,6 +245,7 @@ def test_a_run_that_is_stopped_leaves_no_step_running_and_the_cluster_to_others(
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
+@pytest.mark.long
 def test_a_run_whose_workers_are_all_killed_goes_on_when_one_comes(project, live, tmp_path, capsys):
     """The last test of these workers."""
     go, tries = waiting_for_a_file(project, tmp_path)

@@ -83,6 +83,7 @@ def test_a_glint_that_a_mask_lacks_bores_no_hole_and_narrows_no_vase():
     assert np.array_equal(shapes[0].vertices, shapes[1].vertices)
 
 
+@pytest.mark.long
 def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
     one = outline(BLOB, AROUND[3], False)
     x, y = np.meshgrid(np.arange(320), np.arange(240))
@@ -96,7 +97,12 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
 
 
 @pytest.mark.parametrize(
-    "kind, sides", [("box", (1.0, 0.4, 0.7)), ("cylinder", (1.0, 0.3, 1.0)), ("ball", (1.0, 1.0, 1.0))]
+    "kind, sides",
+    [
+        pytest.param("box", (1.0, 0.4, 0.7), marks=pytest.mark.long),
+        ("cylinder", (1.0, 0.3, 1.0)),
+        ("ball", (1.0, 1.0, 1.0)),
+    ],
 )
 def test_proportions_of_primitives_are_found(kind, sides):
     mesh = unit_shape(kind, np.array(sides)).as_mesh()
@@ -125,6 +131,7 @@ def turns_off(found):
     ]
 
 
+@pytest.mark.long
 def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
     views, shares = views_of(RESTING, POSES, POSES), []
     result = cameras_by_motion(views, lambda share, what: shares.append(share))
@@ -138,6 +145,7 @@ def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
     assert all(np.array_equal(result[n].pose.rotation, again[n].pose.rotation) for n in result)
 
 
+@pytest.mark.long
 def test_of_a_body_that_turns_before_a_camera_at_rest_the_ground_that_stands_still_is_not_believed():
     result = cameras_by_motion(views_of(RESTING, POSES, [POSES[0]] * len(POSES), 480))
     assert len(result) >= 3 and max(turns_off(result)) < 3.0
