@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
 
 from factorlib.align.silhouette import with_prior_focal
 from factorlib.dataset.paths import Refusal
@@ -28,13 +29,14 @@ from factorlib.jsonfile import write_json
 from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
 from factorlib.onboarding.photo_folder import Cameras, folder_and_stem
-from factorlib.shapes.hull import agreements, focal_by_hull
+from factorlib.shapes.hull import agreement, agreements, focal_by_hull, hull_box
 from factorlib.shapes.motion import PhotoForMotion, cameras_by_motion
 from factorlib.shapes.outline import Outline
 
 MOST_PIXELS = 1_000_000  # pixels of a photo for mattes and structure from motion
 DISAGREES = 0.8  # a mask's agreement with the hull of the others, as a share of the median one, below which it is named
 LENS_ERROR = 0.005  # greatest error of a lens by two coefficients, in widths of the image
+MARGINS = (0.05, 0.15)  # margins about the hull's box, in its longer side, of the crops that masks are estimated from
 FOCAL_KEYS = ("fl_x", "camera_angle_x")
 Report = Callable[[float, str], None]
 SHAPE = (
@@ -55,11 +57,13 @@ class View(msgspec.Struct, frozen=True):
         small: the photo, its mask, and its camera before any source is read
         size: height and width of the photo's file as displayed
         doubt: doubt of the matte, 0 for a mask that no network made
+        pixels: the small photo, sRGB-encoded; None where no network made the mask
     """
 
     small: PhotoForMotion
     size: tuple[int, int]
     doubt: float
+    pixels: UInt8[np.ndarray, "h w 3"] | None
 
     def outline(self, name: str, image: SourceImage, focal: float | None = None) -> Outline:
         """Return the outline of the foreground with the camera of a source; `focal` replaces its focal length."""
@@ -105,6 +109,7 @@ def dataset_from_photos(
         elif not meshes:
             cameras, outlines = cameras_of_motion(visible, report)
         report(0.95, "agreement of the masks")
+        views, outlines = look_again(views, outlines, model, folder)
         doubts = doubtful_masks(views, outlines)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
     return missing + [SHAPE] * (not cameras.source and not meshes), cameras.notes + doubts
@@ -132,6 +137,7 @@ def read_views(
         photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), path)
         pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
         uncertain = 0.0
+        shown = None
         if file := masks.get(folder_and_stem(path.name)[1]):
             labels = list(read_labels_in(file, "PHOTOS", opened.size))
             mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
@@ -139,6 +145,7 @@ def read_views(
             mask = opaque
         else:
             network = network or MatteModel(model)
+            shown = pixels
             matte, uncertain = network(pixels, opened.size)
             mask = foreground(matte)
         write_png(folder / "masks" / f"{name}.png", mask[..., None].astype(np.uint8))
@@ -146,7 +153,7 @@ def read_views(
         camera = Camera(photo.width, photo.height, 1.0, (photo.width / 2, photo.height / 2))
         prior = with_prior_focal(camera, photo.focal_px, "exif")
         grey = pixels.mean(axis=2).astype(np.uint8)
-        views[name] = View(PhotoForMotion(grey, objects, np.zeros_like(objects), *prior), opened.size, uncertain)
+        views[name] = View(PhotoForMotion(grey, objects, np.zeros_like(objects), *prior), opened.size, uncertain, shown)
     return views
 
 
@@ -248,6 +255,80 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
     return Cameras({"sfm": True}), outlines
 
 
+def look_again(
+    views: dict[str, View], outlines: list[Outline], model: Path | None, folder: Path
+) -> tuple[dict[str, View], list[Outline]]:
+    """Estimate again the masks that differ from what the other photos show, and return the views and the outlines.
+
+    A network takes what is most conspicuous for the foreground, which may be another thing.  So it is given the part of
+    the photo that shows the hull of the other photos.  A new mask is used if it agrees better with that hull.
+
+    Args:
+        views: the photos
+        outlines: outlines by known cameras
+        model: ONNX file of a matting network; None: that of the extra `masks`
+        folder: the folder of the masks, as `read_views` writes it
+    """
+    overlaps = agreements_of(outlines)
+    unlike = differing(overlaps)
+    again = [name for name in sorted(overlaps, key=overlaps.__getitem__) if views[name].pixels is not None]
+    if not again or len(overlaps) - len(unlike) < 3:
+        return views, outlines
+    network = MatteModel(model)
+    views, by_name = dict(views), {outline.photo: outline for outline in outlines}
+    for name in again:
+        others = [outline for other, outline in by_name.items() if other not in (name, *unlike)]
+        if (box := hull_box(by_name[name], others)) is None:
+            continue
+        for margin in MARGINS:
+            mask, doubt = mask_within(views[name], box, margin, network)
+            objects = box_majority(mask, least_factor(mask.size, MOST_PIXELS))
+            outline = Outline(name, objects.astype(int), by_name[name].camera, pose=by_name[name].pose)
+            if objects.any() and agreement(outline, others) > agreement(by_name[name], others):
+                write_png(folder / "masks" / f"{name}.png", mask[..., None].astype(np.uint8))
+                small = msgspec.structs.replace(views[name].small, objects=objects)
+                views[name] = msgspec.structs.replace(views[name], small=small, doubt=doubt)
+                by_name[name] = outline
+    return views, list(by_name.values())
+
+
+def mask_within(
+    view: View, box: Float[np.ndarray, "2 2"], share: float, network: MatteModel
+) -> tuple[Bool[np.ndarray, "h w"], float]:
+    """Return the mask of a photo, and its doubt, from the part of the photo about a box.
+
+    Args:
+        view: the photo
+        box: least and largest x and y, in pixels of the small photo
+        share: margin about it, in its longer side
+        network: the network that made its mask
+    """
+    assert view.pixels is not None
+    factor = least_factor(view.size[0] * view.size[1], MOST_PIXELS)
+    margin = share * (box[1] - box[0]).max()
+    left, top = np.maximum(box[0] - margin, 0).astype(int)
+    right, bottom = np.ceil(box[1] + margin).astype(int)
+    part = view.pixels[top:bottom, left:right]
+    height, width = (factor * n for n in part.shape[:2])
+    matte, doubt = network(np.ascontiguousarray(part), (height, width))
+    mask = np.zeros(view.size, bool)
+    mask[factor * top : factor * top + height, factor * left : factor * left + width] = foreground(matte)
+    return mask, doubt
+
+
+def agreements_of(outlines: list[Outline]) -> dict[str, float]:
+    """Return the agreement of each photo's mask with all others; none for cameras that see it from one side."""
+    with suppress(InputError):
+        if len(outlines) > 2:
+            return dict(zip((outline.photo for outline in outlines), agreements(outlines)))
+    return {}
+
+
+def differing(overlaps: dict[str, float]) -> list[str]:
+    """Return the photos whose agreement is far below the median."""
+    return [name for name, each in overlaps.items() if each < DISAGREES * np.median(list(overlaps.values()))]
+
+
 def doubtful_masks(views: Mapping[str, View], outlines: list[Outline]) -> list[str]:
     """Name the photos whose masks are to be drawn over, with the reason.
 
@@ -255,14 +336,9 @@ def doubtful_masks(views: Mapping[str, View], outlines: list[Outline]) -> list[s
         views: the photos
         outlines: outlines by known cameras
     """
-    overlaps: list[float] = []
-    with suppress(InputError):  # of cameras that see it from one side
-        overlaps = agreements(outlines) if len(outlines) > 2 else []
     groups = {
         "its border is uncertain": [name for name, view in views.items() if view.doubt > MOST_DOUBT],
-        "it differs from what the other photos show": [
-            outline.photo for outline, each in zip(outlines, overlaps) if each < DISAGREES * np.median(overlaps)
-        ],
+        "it differs from what the other photos show": differing(agreements_of(outlines)),
     }
     line = "draw over the mask of {} in `make label`: {}"
     return [line.format(", ".join(names), why) for why, names in groups.items() if names]

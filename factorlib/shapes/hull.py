@@ -15,7 +15,7 @@ from itertools import count
 import msgspec
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -33,7 +33,7 @@ SMOOTHINGS = (10, 40, 160, 640)  # rounds of smoothing; the most that keep the o
 SMOOTHED_AWAY = 0.004  # overlap (IoU) that smoothing may cost
 SLAB = 1 << 18  # number of points evaluated at once
 LEAST_Z = 1e-6  # least depth in front of a camera
-SAMPLES = 40  # of `agreements`: pixels a side, and depths of each pixel's ray
+SAMPLES = 40  # of `agreement` and `hull_box`: pixels a side, and depths of each pixel's ray
 MARGIN = 1.2  # extent of the examined part of a photo, in those of its outline
 FOCALS = (0.7, 5.0)  # range of `focal_by_hull`, in units of the photo's longer side
 TRIALS = 16  # most focal lengths that are tried
@@ -136,10 +136,10 @@ def hull_overlap(outlines: Sequence[Outline]) -> float:
         return 0.0
 
 
-def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
+def _bounding_ball(outlines: Sequence[Outline], dissenting: int = 0) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the point nearest to the rays through the outlines' centres, and a radius about it.
 
-    The radius is the least extent of an outline, projected back to that point.
+    The radius is the least extent of an outline, projected back to that point; `dissenting` extents may be less.
     """
     normal_matrix = np.zeros((3, 3))
     right = np.zeros(3)
@@ -166,44 +166,86 @@ def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"],
                 cure="check that its mask and its camera belong to the same photo",
             )
         radii.append(depth * bounding_box(outline.view.silhouette)[2] / outline.camera.focal)
-    return middle, min(radii)
+    return middle, sorted(radii)[dissenting]
 
 
-def signed_distance(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray, " n"]:
-    """Return the signed distance f at points of the object's frame, in its units; behind a camera is outside."""
-    least = np.full(len(points), np.inf)
+def signed_distance(outlines: Sequence[Outline], points: Points, dissenting: int = 0) -> Float[np.ndarray, " n"]:
+    """Return the signed distance f at points of the object's frame, in its units; behind a camera is outside.
+
+    Args:
+        outlines: Outlines, all with poses.
+        points: The points.
+        dissenting: Number of outlines that may have a point farther outside than f.
+    """
+    least = np.full((dissenting + 1, len(points)), np.inf)  # the least ones, in order
     for outline in outlines:
         x, y, z = outline.known_pose.apply(points).T
         depth = np.maximum(z, LEAST_Z)
         inner = outline.inner(outline.camera.project(np.column_stack([x, y, depth])))
         inner = np.minimum(inner, FREE) * depth / outline.camera.focal
-        least = np.minimum(least, np.where(z > LEAST_Z, inner, -1.0))
-    return least
+        inner = np.where(z > LEAST_Z, inner, -1.0)
+        for rank in range(dissenting + 1):
+            least[rank], inner = np.minimum(least[rank], inner), np.maximum(least[rank], inner)
+    return least[-1]
 
 
 def agreements(outlines: Sequence[Outline]) -> list[float]:
-    """Return the IoU of each outline with the silhouette of the hull of all others.  All need poses.
+    """Return the agreement of each outline with the others, of which a third may be wrong.  All need poses.
 
     Raises:
         InputError: All photos see the object from the same side, or one has it behind its camera.
     """
-    middle, radius = _bounding_ball(outlines)
-    overlaps = []
-    for k, outline in enumerate(outlines):
-        pose = outline.known_pose
-        extent = MARGIN * bounding_box(outline.view.silhouette)[2] / 2
-        places = outline.middle[:, None] + np.linspace(-extent, extent, SAMPLES)
-        pixels = np.stack(np.meshgrid(*places), axis=-1).reshape(-1, 2)
-        # points on the rays of the pixels, in the object's frame, and whether any of a ray is in the hull of the others
-        depths = pose.apply(middle[None])[0, 2] + MARGIN * radius * np.linspace(-1, 1, SAMPLES)
-        points = outline.camera.rays_through(pixels)[:, None] * depths[:, None]
-        distance = signed_distance(
-            [*outlines[:k], *outlines[k + 1 :]], ((points - pose.translation) @ pose.rotation).reshape(-1, 3)
-        )
-        hull = (distance.reshape(len(pixels), SAMPLES) > -MARGIN * radius / SAMPLES).any(axis=1)
-        mask = outline.inner(pixels) > 0
-        overlaps.append(float((hull & mask).sum() / max((hull | mask).sum(), 1)))
-    return overlaps
+    dissenting = (len(outlines) - 1) // 3
+    return [agreement(outline, [*outlines[:k], *outlines[k + 1 :]], dissenting) for k, outline in enumerate(outlines)]
+
+
+def agreement(outline: Outline, others: Sequence[Outline], dissenting: int = 0) -> float:
+    """Return the IoU of an outline with the silhouette of the hull of others.
+
+    Args:
+        outline: The outline.
+        others: Outlines of other photos.
+        dissenting: Number of others that need not contain the hull.
+
+    Raises:
+        InputError: The others see the object from the same side, or one has it behind its camera.
+    """
+    extent = MARGIN * bounding_box(outline.view.silhouette)[2]
+    pixels = outline.middle + extent * (_sample_grid() - 0.5)
+    hull = _shows_hull(outline, others, pixels, dissenting)
+    mask = outline.inner(pixels) > 0
+    return float((hull & mask).sum() / max((hull | mask).sum(), 1))
+
+
+def hull_box(outline: Outline, others: Sequence[Outline]) -> Float[np.ndarray, "2 2"] | None:
+    """Return the least and largest x and y, in pixels, at which a photo shows the hull of others; None if nowhere.
+
+    Raises:
+        InputError: The others see the object from the same side, or one has it behind its camera.
+    """
+    size = np.array([outline.camera.width, outline.camera.height])
+    pixels = size * _sample_grid()
+    inside = pixels[_shows_hull(outline, others, pixels)]
+    return np.array([inside.min(axis=0), inside.max(axis=0)]) if len(inside) else None
+
+
+def _sample_grid() -> Float[np.ndarray, "n 2"]:
+    """Return the centres of SAMPLES × SAMPLES cells of the unit square."""
+    places = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    return np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+
+
+def _shows_hull(
+    outline: Outline, others: Sequence[Outline], pixels: Float[np.ndarray, "n 2"], dissenting: int = 0
+) -> Bool[np.ndarray, " n"]:
+    """Return the pixels of a photo whose rays meet the hull of others."""
+    pose = outline.known_pose
+    middle, radius = _bounding_ball(others, dissenting)
+    # points on the rays of the pixels, in the object's frame, and whether any of a ray is in the hull
+    depths = pose.apply(middle[None])[0, 2] + MARGIN * radius * np.linspace(-1, 1, SAMPLES)
+    points = outline.camera.rays_through(pixels)[:, None] * depths[:, None]
+    distance = signed_distance(others, ((points - pose.translation) @ pose.rotation).reshape(-1, 3), dissenting)
+    return np.any(distance.reshape(len(pixels), SAMPLES) > -MARGIN * radius / SAMPLES, axis=1)
 
 
 def focal_by_hull(

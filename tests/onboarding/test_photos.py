@@ -56,6 +56,37 @@ def test_cut_outs_with_poses_become_a_valid_dataset_with_a_hull_and_a_focal_leng
     assert "mask of 5 in" in notes[-1] and "differs" in notes[-1] and steps == sorted(steps)
 
 
+class Brightest:
+    """A network that takes the brightest thing of a picture for its foreground."""
+
+    def __init__(self, path=None):
+        pass
+
+    def __call__(self, pixels, size):
+        inside = pixels.mean(axis=2) > 0.9 * pixels.max()
+        return np.asarray(Image.fromarray(inside).resize(size[::-1])).astype(float), 1.0
+
+
+def test_a_mask_of_another_thing_is_found_again_where_the_other_photos_show_the_body(cut_outs, monkeypatch):
+    """A white square in the corner of two photos is brighter than the body, which is grey."""
+    bodies = {}
+    for file in (cut_outs / "capture" / "images").iterdir():
+        alpha = rasterise(SHAPES["blob"](), CAMERA, POSES[int(file.stem)]).label > 0
+        grey = np.where(alpha, 120, 20)
+        grey[:25, :25] = 250 if file.stem in "25" else 20
+        Image.fromarray(np.dstack([grey] * 3).astype(np.uint8)).save(file)
+        bodies[file.stem] = alpha
+    cameras = cut_outs / "capture" / "transforms.json"
+    lens = {"fl_x": CAMERA.focal, "w": CAMERA.width, "h": CAMERA.height}
+    cameras.write_text(json.dumps(json.loads(cameras.read_text()) | lens))
+    monkeypatch.setattr("factorlib.onboarding.from_photos.MatteModel", Brightest)
+    _, notes = dataset_from_photos(cut_outs / "mine", cut_outs / "capture", None, None, lambda share, text: None)
+    for name, alpha in bodies.items():
+        mask = np.asarray(Image.open(cut_outs / "mine" / "masks" / f"{name}.png")) > 0
+        assert (mask & alpha).sum() > 0.98 * (mask | alpha).sum(), name
+    assert not any("differs" in note for note in notes)
+
+
 @pytest.mark.parametrize("mask", ["7_mask.png", "7.jpg.png", "masks/7.png", "masks/7.jpg", "alpha/m.png"])
 def test_masks_are_no_photos_and_the_cameras_tell_which_images_are(tmp_path, mask):
     for name in (mask, "images/7.jpg", "images_2/7.jpg", "other/8.jpg"):
