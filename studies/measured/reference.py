@@ -38,7 +38,10 @@ DOUBT = 0.01
 ROUNDING = 1e-5
 FOLDER = ROOT / "tests" / "studies" / "regression"
 COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
-SMALL = ("masks.pixels=3000", "solve.cells=150", "solve.splittings=1", "export.height=64", "export.mitsuba_height=64")
+SMALL = (
+    *("masks.pixels=2500", "surface.observations=400", "solve.cells=120", "solve.observations=500"),
+    *("solve.splittings=1", "export.height=64", "export.mitsuba_height=32"),
+)
 # dotted path in metrics.json -> lowest, highest, meaning; a quarter beyond the worst of five trained networks × two
 # seeds of the solve
 SPHERE = "light.mean.channel_per_photo.{}.estimate.rmse"
