@@ -30,6 +30,11 @@ from factorlib.urm.reduction import merge, sample
 log = logging.getLogger("factorlib.urm")
 
 
+# Largest distance of an object from the ground of its photo, in its own extents.  Estimated poses of chairs on one
+# floor are up to 0.03 apart.
+MOST_HEIGHT = 0.05
+
+
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Selection of pixels, and resolution of visibility."""
 
@@ -91,18 +96,26 @@ def read_meshes(inputs: Inputs, poses: dict[str, ObjectPose]) -> dict[str, Mesh]
 
 
 def ground_plane(inputs: Inputs, meshes: dict[str, Mesh], poses: dict[str, ObjectPose]) -> Plane | None:
-    """Return the ground of dataset.yaml, or else the lowest plane on which an object rests; None without one.
+    """Return the ground of dataset.yaml, or else the lowest plane on which an object rests, in the camera's frame.
 
-    The plane is in the camera's frame.
+    Objects of a photo stand on one ground: None if one of them hovers over that plane, or sinks into it.
     """
     given = msgspec.convert(inputs.facts["dataset.ground"], GroundSlice).ground
     if given is not None:
         normal = np.array(given.normal)
         return Plane(normal / np.linalg.norm(normal), np.array(given.point))
+    placed = {name: poses[name].pose.apply(mesh.vertices) for name, mesh in meshes.items()}
     planes = []
     for name, mesh in meshes.items():
-        pose = poses[name].pose
-        upright = pose.rotation.T @ [0.0, -1.0, 0.0]
-        planes.append(resting_plane(mesh.vertices, pose.apply(mesh.vertices), pose.rotation, upright[None]))
+        rotation = poses[name].pose.rotation
+        upright = rotation.T @ [0.0, -1.0, 0.0]
+        planes.append(resting_plane(mesh.vertices, placed[name], rotation, upright[None]))
     resting = [plane for plane in planes if plane is not None]
-    return min(resting, key=lambda plane: plane.point @ resting[0].normal, default=None)
+    if not resting:
+        return None
+    ground = min(resting, key=lambda plane: plane.point @ resting[0].normal)
+    for vertices in placed.values():
+        height = ((vertices - ground.point) @ ground.normal).min()
+        if abs(height) > MOST_HEIGHT * np.linalg.norm(np.ptp(vertices, axis=0)):
+            return None
+    return ground

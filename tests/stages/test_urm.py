@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.dataset.schema import ObjectsSlice
@@ -11,6 +12,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.jsonfile import write_json
+from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.poses import ObjectPose
 from factorlib.stage import Inputs
@@ -107,6 +109,22 @@ def test_the_surroundings_are_written_with_the_observations_and_black_ones_say_n
     photo = msgspec.structs.replace(two, folders={**two.folders, "masks": tmp_path / "masks"})
     found = read_rgb_exr(run(tmp_path / "grey", photo).parent / "background" / "a.exr")
     assert found.any() and np.allclose(found[found.any(-1)], 0.25)
+
+
+@pytest.mark.parametrize("height, stands", [(0.0, True), (0.04, True), (0.2, False), (-0.2, False)])
+def test_objects_of_which_one_hovers_have_no_ground(two, height, stands):
+    """Boxes whose diagonal is √3."""
+    solid = trimesh.creation.box()
+    box = Mesh(np.asarray(solid.vertices), np.asarray(solid.faces), np.zeros((8, 3)), np.ones(12, np.int16))
+    poses = {
+        name: msgspec.convert({"rotation": np.eye(3).tolist(), "translation": place}, ObjectPose)
+        for name, place in {"left": (-1, 0, 6), "right": (1, -height * 3**0.5, 6)}.items()
+    }
+    ground = urm.ground_plane(two, dict.fromkeys(poses, box), poses)
+    assert (ground is not None) == stands
+    if ground is not None:
+        np.testing.assert_allclose(ground.normal, [0, -1, 0], atol=1e-6)
+        assert ground.point[1] == pytest.approx(0.5)
 
 
 def test_urm_and_export_place_a_scaled_mesh_alike(tmp_path, two):
