@@ -108,8 +108,9 @@ def dataset_from_photos(
             cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
         elif not meshes:
             cameras, outlines = cameras_of_motion(visible, report)
-        report(0.95, "agreement of the masks")
-        views, outlines = look_again(views, outlines, model, folder)
+        views, outlines = refine_masks(
+            views, outlines, model, folder, lambda share, text: report(0.9 + share / 10, text)
+        )
         doubts = doubtful_masks(views, outlines)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
     return missing + [SHAPE] * (not cameras.source and not meshes), cameras.notes + doubts
@@ -137,7 +138,7 @@ def read_views(
         photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), path)
         pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
         uncertain = 0.0
-        shown = None
+        matted = None
         if file := masks.get(folder_and_stem(path.name)[1]):
             labels = list(read_labels_in(file, "PHOTOS", opened.size))
             mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
@@ -145,7 +146,7 @@ def read_views(
             mask = opaque
         else:
             network = network or MatteModel(model)
-            shown = pixels
+            matted = pixels
             matte, uncertain = network(pixels, opened.size)
             mask = foreground(matte)
         write_png(folder / "masks" / f"{name}.png", mask[..., None].astype(np.uint8))
@@ -153,7 +154,9 @@ def read_views(
         camera = Camera(photo.width, photo.height, 1.0, (photo.width / 2, photo.height / 2))
         prior = with_prior_focal(camera, photo.focal_px, "exif")
         grey = pixels.mean(axis=2).astype(np.uint8)
-        views[name] = View(PhotoForMotion(grey, objects, np.zeros_like(objects), *prior), opened.size, uncertain, shown)
+        views[name] = View(
+            PhotoForMotion(grey, objects, np.zeros_like(objects), *prior), opened.size, uncertain, matted
+        )
     return views
 
 
@@ -255,20 +258,26 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
     return Cameras({"sfm": True}), outlines
 
 
-def look_again(
-    views: dict[str, View], outlines: list[Outline], model: Path | None, folder: Path
+def refine_masks(
+    views: dict[str, View], outlines: list[Outline], model: Path | None, folder: Path, report: Report
 ) -> tuple[dict[str, View], list[Outline]]:
-    """Estimate again the masks that differ from what the other photos show, and return the views and the outlines.
+    """Estimate each network's mask again, from the part of the photo that shows the object.
 
-    A network takes what is most conspicuous for the foreground, which may be another thing.  So it is given the part of
-    the photo that shows the hull of the other photos.  A new mask is used if it agrees better with that hull.
+    A network takes the most conspicuous thing of a picture for its foreground, which may be another object.  So it is
+    given the part of the photo that shows the hull of the other photos.  A new mask is used if it agrees better with
+    that hull.
 
     Args:
         views: the photos
         outlines: outlines by known cameras
         model: ONNX file of a matting network; None: that of the extra `masks`
         folder: the folder of the masks, as `read_views` writes it
+        report: called with the completed share and the current activity
+
+    Returns:
+        The views and the outlines.
     """
+    report(0.0, "agreement of the masks")
     overlaps = agreements_of(outlines)
     unlike = differing(overlaps)
     again = [name for name in sorted(overlaps, key=overlaps.__getitem__) if views[name].pixels is not None]
@@ -276,20 +285,33 @@ def look_again(
         return views, outlines
     network = MatteModel(model)
     views, by_name = dict(views), {outline.photo: outline for outline in outlines}
-    for name in again:
+    for k, name in enumerate(again):
+        report(k / len(again), f"{name}: mask within the hull")
         others = [outline for other, outline in by_name.items() if other not in (name, *unlike)]
-        if (box := hull_box(by_name[name], others)) is None:
-            continue
-        for margin in MARGINS:
-            mask, doubt = mask_within(views[name], box, margin, network)
-            objects = box_majority(mask, least_factor(mask.size, MOST_PIXELS))
-            outline = Outline(name, objects.astype(int), by_name[name].camera, pose=by_name[name].pose)
-            if objects.any() and agreement(outline, others) > agreement(by_name[name], others):
-                write_png(folder / "masks" / f"{name}.png", mask[..., None].astype(np.uint8))
-                small = msgspec.structs.replace(views[name].small, objects=objects)
-                views[name] = msgspec.structs.replace(views[name], small=small, doubt=doubt)
-                by_name[name] = outline
+        with suppress(InputError):  # all others see it from one side
+            views[name], by_name[name] = refine_mask(views[name], by_name[name], others, network, folder)
     return views, list(by_name.values())
+
+
+def refine_mask(
+    view: View, outline: Outline, others: list[Outline], network: MatteModel, folder: Path
+) -> tuple[View, Outline]:
+    """Return the view and the outline with the best of the masks that crops of the photo give; write a new mask."""
+    if (box := hull_box(outline, others)) is None:
+        return view, outline
+    best = agreement(outline, others)
+    for margin in MARGINS:
+        mask, doubt = mask_within(view, box, margin, network)
+        objects = box_majority(mask, least_factor(mask.size, MOST_PIXELS))
+        candidate = Outline(outline.photo, objects.astype(int), outline.camera, pose=outline.pose)
+        if objects.any() and (overlap := agreement(candidate, others)) > best:
+            best = overlap
+            outline = candidate
+            view = msgspec.structs.replace(
+                view, small=msgspec.structs.replace(view.small, objects=objects), doubt=doubt
+            )
+            write_png(folder / "masks" / f"{outline.photo}.png", mask[..., None].astype(np.uint8))
+    return view, outline
 
 
 def mask_within(
