@@ -5,6 +5,8 @@
 $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(eval override $(name) := $$(value $(name)))$(eval export $(name))))
 override export GOAL = $@
 SHELL := /bin/bash
+# Containers often set it; every process would then compile what it imports, for 3 s.
+unexport PYTHONDONTWRITEBYTECODE
 override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
@@ -35,10 +37,10 @@ lock: .venv/ready
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache && $(PY) -m ruff format --check --no-cache --quiet
 	@.venv/bin/lint-imports --no-cache && $(PY) -m mypy
-	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 env -u DATASET -u SET -u HELD_OUT -u FORCE $(PY) -m pytest -n 2 -p no:cacheprovider
+	@OMP_NUM_THREADS=1 env -u DATASET -u SET -u HELD_OUT -u FORCE $(PY) -m pytest -n 2 -p no:cacheprovider
 
 test-long: .venv/ready
-	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
+	@OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
 
 docs: .venv/ready
 	@test -x .venv/bin/mkdocs || EXTRAS=docs $(PY) -I factorlib/setup.py extras

@@ -18,7 +18,7 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import apply_tone
 from factorlib.reflection import reflection_operator
-from factorlib.render.resynthesis import Reflector, observed_cells, read_surroundings, render_balls, resynthesise
+from factorlib.render.resynthesis import Reflector, observed_cells, read_shading, render_balls
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import read_materials, select_materials
 from factorlib.stage import Inputs, Progress
@@ -32,7 +32,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Reflection operator and sizes of pictures."""
 
     operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
-    """Reflection operator."""
+    """Reflection operator of balls and reflectance maps; that of the re-synthesis is `shading.operator`."""
     ball_size: Size = 128
     """Width and height of a ball's picture, in pixels."""
     map_size: Size = 64
@@ -54,28 +54,24 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     operator = reflection_operator(params.operator, weights=inputs["train"])
     reflector = Reflector(operator, light, model.curvature(slice_.illumination))
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
-    total = 10 + len(names)
     materials = select_materials(exported, names, file)
-
-    def report(done: float, pixels: float) -> None:
-        """Report progress of the re-synthesis, in pixels."""
-        progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
-
-    around = read_surroundings(inputs.folders, name, model, exported.gauge.export_factor or 1.0)
-    radiance = resynthesise(reflector, materials, photo, geometry, report, around)
+    radiance, specular = read_shading(inputs["shading"], name)
+    if "detail.R" in geometry:
+        radiance = radiance * np.stack([geometry[f"detail.{channel}"] for channel in "RGB"], axis=-1)
+    radiance = radiance + specular
     if tone := model.tone.get(name):
         radiance = apply_tone(radiance, tone.exponent, tone.pivot)
     _write(out / "resynthesis" / name, radiance, exposure, ball=False)
     # balls and reflectance maps, material by material
     observed = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
-        progress(9 + k, total, f"{name}: {label}")
+        progress(k - 1, len(names), f"{name}: {label}")
         shaded, reflectance_map = render_balls(reflector, material, (params.ball_size, params.map_size))
         _write(out / "materials" / name / label, shaded, exposure, ball=True)
         pixels = observed & (np.rint(photo["label"]) == k)
         cells = observed_cells(np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1), params.map_size)
         _write(out / "reflectance_maps" / name / label, reflectance_map, exposure, ball=True, observed=cells)
-    progress(total, total, name)
+    progress(len(names), len(names), name)
 
 
 def _write(stem: Path, radiance: np.ndarray, exposure: float, ball: bool, observed: np.ndarray | None = None) -> None:

@@ -26,10 +26,8 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
-from factorlib.reflection import reflection_operator
-from factorlib.render.resynthesis import Reflector, read_surroundings, resynthesise_parts
-from factorlib.results.lobe_table import read_photo_light
-from factorlib.results.materials import MaterialTable, read_materials, select_materials
+from factorlib.render.resynthesis import read_shading
+from factorlib.results.materials import MaterialTable, read_materials
 from factorlib.results.surface_table import DetailEvidence, read_surface
 from factorlib.results.texture_table import FACTORS, FILE, TextureEvidence, TextureTable, write_factors
 from factorlib.stage import Inputs, Progress
@@ -178,7 +176,7 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
         if tone := self.table.model.tone.get(name):
             radiance = invert_tone(radiance, tone.exponent, tone.pivot)
         label = np.where(selected, np.rint(photo["label"]), 0).astype(int)
-        parts = self.parts(name, {**photo, "label": label}, geometry)
+        parts = read_shading(self.inputs["shading"], name).astype(float)
         cosine = np.sum([geometry[f"normal.{a}"] * geometry[f"view.{a}"] for a in "xyz"], axis=0).clip(0, 1)[y, x]
         cluster = (y // CLUSTER_PIXELS) * label.shape[1] + x // CLUSTER_PIXELS
         for mesh, rows, operator in attach_to_meshes(self.photos[name], np.column_stack([x, y]), fine):
@@ -191,19 +189,6 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
                     diffuse, specular = (part[y[pixels], x[pixels]] for part in parts)
                     observed = radiance[pixels], diffuse, specular, cosine[pixels]
                     yield key, observe_texture(*observed, (operator[places], cluster[pixels]))
-
-    def parts(self, name: str, photo: Channels, geometry: Channels) -> Float[np.ndarray, "2 h w 3"]:
-        """Return the diffuse radiance of a photo without detail, and the specular radiance."""
-        inputs = self.inputs
-        materials = select_materials(self.table, inputs.facts["dataset.materials"], inputs["solve"] / "materials.json")
-        reflector = Reflector(
-            reflection_operator("network", weights=inputs["train"]),
-            read_photo_light(inputs["solve"], name, self.lights[name]),
-            self.table.model.curvature(self.lights[name].illumination),
-        )
-        around = read_surroundings(inputs.folders, name, self.table.model)
-        bare = {channel: values for channel, values in geometry.items() if channel not in DETAIL}
-        return resynthesise_parts(reflector, materials, photo, bare, surroundings=around)
 
 
 def longest_edge(name: str, mesh: Mesh, photos: dict[str, AlignedPhoto], pixels: float) -> float:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from factorlib.conventions import FRONT
 from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
+from factorlib.images.exr import read_exr
 from factorlib.inference.interreflection import bounced_light
 from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.lobes import Lobes
@@ -158,6 +159,7 @@ NARROW = 1000.0  # sharpness above which a spline does not follow a lobe's highl
 RIM = np.pi / 2 - 1e-3  # largest θ of a node, radians: the surface is still visible there
 MARGIN = 4  # periodic nodes beyond each end
 GAP = 6  # widest gap between observed normals that is closed, in cells
+SHADING = [f"{part}.{channel}" for part in ("diffuse", "specular") for channel in "RGB"]  # channels of `shading`
 
 
 class Surroundings(msgspec.Struct, frozen=True):
@@ -165,48 +167,30 @@ class Surroundings(msgspec.Struct, frozen=True):
 
     Attributes:
         observations: the observations, with their visibility
-        bounced: G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture over the factor of the
-            materials' gauge; None is zero
+        bounced: G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture; None is zero
     """
 
     observations: Observations
     bounced: Float[np.ndarray, "n 6"] | None = None
 
 
-def read_surroundings(
-    folders: Mapping[str, Path], photo: str, model: Model, factor: float = 1.0
-) -> Surroundings | None:
+def read_surroundings(folders: Mapping[str, Path], photo: str, model: Model) -> Surroundings | None:
     """Read visibility, bounced radiance and positions of a photo's observations; None if the model uses none.
 
     Args:
         folders: folders of the stages `urm` and, if there is one, `surface`
         photo: name of the photo
         model: effects that the solve included
-        factor: factor of the gauge of the rendered materials; it divides bounced radiance, as it divides lights
     """
     if not (model.self_shadowing or model.distance):
         return None
     table = with_surface_normals(read_observations(folders["urm"] / f"{photo}.parquet"), folders.get("surface"))
     if not model.self_shadowing:
         table = msgspec.structs.replace(table, visibility=None, occluder=None)
-    bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None
-    return Surroundings(table, None if bounced is None else bounced / factor)
+    return Surroundings(table, bounced_light(table, table.radiance.astype(float)) if model.interreflection else None)
 
 
 def resynthesise(
-    reflector: Reflector,
-    materials: Sequence[Reflectance],
-    photo: Channels,
-    geometry: Channels,
-    report: Report = silently,
-    surroundings: Surroundings | None = None,
-) -> Float[np.ndarray, "h w 3"]:
-    """Return the photo's linear radiance, the sum of `resynthesise_parts`."""
-    diffuse, specular = resynthesise_parts(reflector, materials, photo, geometry, report, surroundings)
-    return diffuse + specular
-
-
-def resynthesise_parts(
     reflector: Reflector,
     materials: Sequence[Reflectance],
     photo: Channels,
@@ -220,7 +204,7 @@ def resynthesise_parts(
         reflector: the light
         materials: label k is materials[k − 1]
         photo: channel label
-        geometry: channels normal.x/y/z, view.x/y/z and, if diffuse reflectance has detail, detail.R/G/B
+        geometry: channels normal.x/y/z and view.x/y/z
         report: receives the number of pixels done and their total
         surroundings: occlusion and bounces; None for neither
     """
@@ -246,12 +230,16 @@ def resynthesise_parts(
         if bounced is not None:
             facing = np.sum(normals * views, 1, keepdims=True) > 0
             radiance += reflect_bounces(material, bounced) * facing
-        if "detail.R" in geometry:
-            radiance[0] *= np.stack([geometry[f"detail.{channel}"][pixels] for channel in "RGB"], axis=-1)
         pictures[:, pixels] = radiance
         before += int(pixels.sum())
         report_pixels(0, 0)
     return pictures
+
+
+def read_shading(folder: Path, photo: str) -> Float[np.ndarray, "2 h w 3"]:
+    """Read the diffuse and the specular radiance of a photo's pixels from the folder of the stage `shading`."""
+    channels = read_exr(folder / f"{photo}.exr")
+    return np.stack([np.stack([channels[name] for name in SHADING[k : k + 3]], axis=-1) for k in (0, 3)])
 
 
 def reflect_bounces(material: Reflectance, bounced: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "2 n 3"]:

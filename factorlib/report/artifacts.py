@@ -20,7 +20,7 @@ from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface_table import SurfaceTable, read_surface
 from factorlib.results.texture_table import TextureTable, read_table
 
-STAGES = ["masks", "align", "urm", "surface", "train", "solve", "texture", "export", "render", "evaluate"]
+STAGES = ["masks", "align", "urm", "surface", "train", "solve", "shading", "texture", "export", "render", "evaluate"]
 
 T = TypeVar("T")
 Channels = dict[str, Float[np.ndarray, "h w"]]

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,8 +19,8 @@ from factorlib.render.resynthesis import Reflector
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.texture_table import TextureTable, read_table, read_textures
-from factorlib.stage import Inputs
-from stages import texture
+from factorlib.stage import Inputs, silent
+from stages import shading, texture
 from tests.export.made_export import light, write_obj
 from tests.refusal import refusal
 from tests.runner.toy import files_of
@@ -37,7 +38,7 @@ def stripes(place: np.ndarray) -> np.ndarray:
 
 def photographed(folder: Path, paint) -> Inputs:
     """What the stages before leave of three photos of a painted ball, each in a light of its own."""
-    for stage in ("align", "masks", "solve", "urm"):
+    for stage in ("align", "masks", "solve", "shading"):
         (folder / stage).mkdir(parents=True)
     write_obj(folder / "ball.obj", (1, 1, 1))
     ball = read_mesh(folder / "ball.obj", ["red"], "red")
@@ -74,8 +75,13 @@ def photographed(folder: Path, paint) -> Inputs:
     write_lobes(folder / "solve" / "lobes.parquet", lights)
     facts = {"dataset.materials": ["red"], "dataset.objects": dict.fromkeys(TURNS, entry)}
     facts["dataset.light"] = {name: {"illumination": name, "world_from_camera": None} for name in TURNS}
-    folders = {stage: folder / stage for stage in ("align", "masks", "solve", "urm")} | {"train": SHIPPED}
-    return Inputs(folders, facts, {"ball.obj": folder / "ball.obj"})
+    folders = {stage: folder / stage for stage in ("align", "masks", "solve", "shading")} | {"train": SHIPPED}
+    inputs = Inputs(folders, facts, {"ball.obj": folder / "ball.obj"})
+    for name in TURNS:
+        slices = facts | {"dataset.light": facts["dataset.light"][name]}
+        of_photo = msgspec.structs.replace(inputs, facts=slices, photo=name)
+        shading.main(shading.Params(), of_photo, folders["shading"], silent)
+    return inputs
 
 
 def run(inputs: Inputs, out: Path, **params) -> Path:
