@@ -89,8 +89,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         materials = self.solution.point.materials
         errors = self.errors.materials
         relative = errors.specular.mean(1) / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
-        fitted = self.solution.materials.point.materials
-        unknowns = material_unknowns(msgspec.structs.replace(fitted, roughness=materials.roughness))
+        unknowns = material_unknowns(self.solution.fit.point.materials)
         rows = zip(unknowns, relative.tolist(), errors.roughness.tolist(), strict=True)
         classes = self.problem.known.classes
         return [table.Kind(*likeliest_class(*row, classes.get(m))) for m, row in enumerate(rows)]

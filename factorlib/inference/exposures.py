@@ -46,7 +46,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
     moving = np.unique(group[movable])
     if not len(moving):
         return state
-    terms = [LightTerms(likelihood, group) for likelihood in state.likelihoods]
+    terms = [ExposureTerms(likelihood, group) for likelihood in state.likelihoods]
 
     def move(logs: Float[np.ndarray, " g"]) -> tuple[Float[np.ndarray, "m 7"], Float[np.ndarray, " m"]]:
         """Return the unknowns after a move, and log f of every group."""
@@ -73,7 +73,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
     return descent.linearise([term.moved(log_factors, materials) for term in terms], moved)
 
 
-class LightTerms:
+class ExposureTerms:
     """Prior of one light and its exposures along (1).
 
     Args:

@@ -76,7 +76,7 @@ class SolveState(msgspec.Struct, frozen=True):
 
     Attributes:
         fit: Fit of the last step.
-        materials: Fit of the last step that fitted materials, to observations with reliable normals.
+        materials: Last fit of materials and lights together, to observations with reliable normals; before the prior.
         shadows: Decision on the use of visibility.
         interreflection: Decision on light that surfaces send each other.
         backgrounds: Decision on each light's background; empty if not tried.
@@ -112,7 +112,7 @@ class SolveState(msgspec.Struct, frozen=True):
     def effective_problem(self, problem: JointProblem) -> JointProblem:
         """Return the problem under the chosen effects: with or without shadows, interreflection and backgrounds."""
         accepted = [decision.accepted for decision in self.backgrounds]
-        return problem.with_effects(self.shadows.accepted, self.interreflection.accepted).with_backgrounds(accepted)
+        return problem.with_effects(self.shadows.accepted, self.interreflection.accepted).keep_backgrounds(accepted)
 
 
 class Solution(SolveState, frozen=True, kw_only=True):

@@ -2,14 +2,15 @@
 
 effects     Held-out observations choose shadows, and marginal likelihoods interreflection
             (`factorlib.inference.model_selection`).
-background  Marginal likelihoods choose the lights that are also observed by the surroundings that photos show
+background  Marginal likelihoods choose the lights whose prior also uses the surroundings that photos show
             (`factorlib.inference.background`).
 tone        Held-out observations choose tone curves.
 distances   Marginal likelihoods choose distances of lights.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
-splitting   The cells with most of a light's energy split in four while its marginal likelihood rises
-            (`factorlib.inference.splitting`).  Light sharper than a cell makes materials look smoother.
-prior       The errors of the model give the prior on materials its say (`factorlib.inference.material_posterior`).
+splitting   The 24 cells with most of a light's energy split in about four while the log Bayes factor for that is very
+            strong (`factorlib.inference.splitting`).  In a light blurred by large cells, materials come out too smooth.
+prior       Each material is estimated again under the prior on materials, with the errors of the model in its
+            covariance (`factorlib.inference.material_posterior`).
 lights      Given the materials, lights are fitted to observations of any confidence.
 suns        Each light is compared with one that has a sun in place of its brightest cells (`factorlib.inference.suns`).
 
@@ -50,7 +51,7 @@ class SolveRequest(msgspec.Struct, frozen=True):
     """Input of a joint solve: the problem, its initial fits, the options and the runner.
 
     Attributes:
-        problem: All observations; its loss judges the held-out ones.
+        problem: All observations, fitted and held out.
         starts: Initial fits of the first trial, of which the best one continues.
         options: Options of the user.
         run: Runner of the fits.

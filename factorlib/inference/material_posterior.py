@@ -58,7 +58,7 @@ def material_posterior(
         fitted: θ̂.
         covariance: S.
         model_error: Standard deviations of M, which is diagonal.
-        free: Mask of the unknowns that are not known.
+        free: Mask of the unknowns to be estimated.
         name: Class of the material, if the user named it.
     """
     deviation = np.where(free, np.sqrt(np.diag(covariance) + model_error**2), 0.0)

@@ -8,9 +8,9 @@ A material is dielectric, metal or fabric, with shares π_c.  Let l = log k_s of
 Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, 0.02 to 0.08, equally in all colours.  Metals
 reflect more, with a tint.  Fabrics scatter within, and GGX shows this as a strong and very rough part.  Both parts of
 metals and fabrics have one tint (ε); without ε, orange wood of a blue specular part would be a fabric.  N(l − l̄) is
-over two dimensions.  (1) is a density where k_d is 0; elsewhere ε makes metals and fabrics less likely than π.  A
-smooth surface with k_s = 0.3 is therefore metal, and a k_s of 0.2 at roughness 1 is fabric; neither is inferred
-without evidence.  Where the user names a material's class, that one alone has a share.
+over two dimensions.  The factor with ε is not normalised: it is 1 where k_d is 0 and smaller where tints
+differ, so that metals and fabrics are then less likely than π.  For example, k_s = 0.3 on a smooth surface indicates a
+metal, and k_s = 0.2 at roughness 1 a fabric.  Where the user names a material's class, that one alone has a share.
 
 μ_c, S_c, τ_c and ε_c are those of measured materials (`studies.measured.material_classes`, material_classes.json).
 They are widened by the unknown scale of reflectances and the unknown white balance of photos (`SCALE_DEVIATION`,

@@ -80,7 +80,7 @@ Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem
 
 
 class Losses(NamedTuple):
-    """Robust losses of each light's held-out observations, and their cluster numbers."""
+    """Robust losses of the observations that decide, by light, and their cluster numbers."""
 
     values: list[Float[np.ndarray, " n"]]
     clusters: list[Int[np.ndarray, " n"]]
@@ -133,7 +133,7 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Result of a model comparison: fit of the chosen model, and one decision per light (or per splitting)."""
+    """Result of a model comparison: fit of the chosen model, and one decision per light (one in all for bounces)."""
 
     fit: Fit
     evidence: list[Decision]
@@ -158,7 +158,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
         options: Options of the user.
         run_fit: Function that fits a model.
     """
-    sample = comparison_sample(problem, options).with_backgrounds()
+    sample = comparison_sample(problem, options).without_backgrounds()
     hidden = any(block.visibility is not None for block in problem.blocks)
     shadows = options.self_shadowing if hidden else "off"
     bounces = options.interreflection if problem.has_bounces else "off"
@@ -234,12 +234,12 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
     if options.background == "off" or not any(candidates):
         return Selection(before, [Decision(False) for _ in candidates])
     sample = comparison_sample(problem, options)
-    without = sample.with_backgrounds()
+    without = sample.without_backgrounds()
     accepted = np.array(candidates)
     factors = np.zeros(len(candidates))
     fit = before
     while accepted.any():
-        model = sample.with_backgrounds(accepted.tolist())
+        model = sample.keep_backgrounds(accepted.tolist())
         fit = run_fit("background", model, fit, BACKGROUND_SCHEDULE)
         start = run_fit("background", without, fit, TEMPERED_LIGHTS)
         values = [run_fit("background", each, start, LIGHTS_ONLY).light_values for each in (without, model)]
@@ -249,6 +249,8 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
         if not doubtful.any():
             break
         accepted &= ~doubtful
+    if not accepted.any():
+        fit = before
     evidence = [
         Decision(bool(keep), log_bayes_factor=float(factor)) if has else Decision(False)
         for keep, factor, has in zip(accepted, factors, candidates, strict=True)
@@ -292,9 +294,9 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
 def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
     """Choose distances of lights by their marginal likelihoods.
 
-    Materials and all lights are fitted at infinity and at each of `CURVATURES`, because materials that were fitted in
-    far lights compensate for these.  But materials fitted in near lights explain every light better.  So each light is
-    compared once more, given the materials of the near lights, and the smaller Bayes factor counts.
+    Materials adapt to the distances at which they are fitted.  Each light is therefore compared twice: with materials
+    and lights fitted at infinity and at each of `CURVATURES`, and, if that favours a near light, with the materials of
+    the near lights.  The smaller Bayes factor counts.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
@@ -328,7 +330,8 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         near_fit = fit_with_curvatures(near)
         alternatives = (dict.fromkeys(near, 0.0), near)
         far_values, near_values = (fit_with_curvatures(c, near_fit, LIGHTS_ONLY).light_values for c in alternatives)
-        factor = np.minimum(factor, (np.array(far_values) - near_values) / 2)
+        given_materials = (np.array(far_values) - near_values) / 2
+        factor[list(near)] = np.minimum(factor, given_materials)[list(near)]
     for k in candidates:
         evidence[k] = Decision(bool(factor[k] > VERY_STRONG), log_bayes_factor=float(factor[k]))
     curvatures = {k: c * near_share(factor[k]) for k, c in near.items() if evidence[k].accepted}

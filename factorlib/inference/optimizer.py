@@ -135,7 +135,7 @@ class Descent(msgspec.Struct, frozen=True):
         prior: Prior on materials.
         spread: Map over lights.
         report: Called at every factorisation.
-        free: Mask of the material unknowns that are not known.
+        free: Mask of the material unknowns to be estimated.
     """
 
     prior: MaterialPrior

@@ -36,4 +36,4 @@ class SolveOptions(Struct, frozen=True):
     """Finite distance of a light; auto: used if the marginal likelihood supports it very strongly (log Bayes factor
     over 5)."""
     seed: Seed = 0
-    """Seed of the held-out cells and of the observations that are drawn."""
+    """Seed of the choice of held-out regions of mirror directions, and of the observations that are drawn."""

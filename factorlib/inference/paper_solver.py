@@ -96,7 +96,7 @@ def solve_paper(
         options: Options.
         report: Called with each reported subset.
     """
-    problem = problem.with_effects(False, False).with_backgrounds()
+    problem = problem.with_effects(False, False).without_backgrounds()
     objective = PaperObjective(problem, materials, options)
     history = list[Event]()
     blocks = problem.blocks

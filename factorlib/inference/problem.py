@@ -105,11 +105,15 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Return the problem with shadows or interreflection switched off where the argument is False."""
         return self.with_blocks([block.with_effects(shadows, bounces) for block in self.blocks])
 
-    def with_backgrounds(self, accepted: Sequence[bool] = ()) -> JointProblem:
-        """Return the problem with the backgrounds of those lights alone for which `accepted` is True."""
-        pairs = zip(self.blocks, accepted or [False] * len(self.blocks), strict=True)
-        blocks = [block if keep else msgspec.structs.replace(block, background=None) for block, keep in pairs]
+    def keep_backgrounds(self, keep: Sequence[bool]) -> JointProblem:
+        """Return the problem with the backgrounds of those lights alone for which `keep` is True; empty for none."""
+        pairs = zip(self.blocks, keep or [False] * len(self.blocks), strict=True)
+        blocks = [block if kept else msgspec.structs.replace(block, background=None) for block, kept in pairs]
         return self.with_blocks(blocks)
+
+    def without_backgrounds(self) -> JointProblem:
+        """Return the problem without backgrounds."""
+        return self.keep_backgrounds([])
 
     def with_blocks(self, blocks: list[Block]) -> JointProblem:
         """Return the problem with other observations."""

@@ -1,10 +1,10 @@
 """Cells of a light that split in four while the light's marginal likelihood rises.
 
 Smaller cells obey the same Gaussian process as larger ones.  So, given the materials and the hyperparameters, a light
-has a marginal likelihood with either, and lights are independent of each other.  Let φ be the objective of a light with
-its determinants, (1) of `factorlib.inference.likelihood`.  The log Bayes factor of light i for smaller cells is
+has a marginal likelihood with either, and lights are independent of each other.  Let F be minus twice the log marginal
+likelihood of a light, (1) of `factorlib.inference.likelihood`.  The log Bayes factor of light i for smaller cells is
 
-    log B_i = (φ_i(cells) − φ_i(smaller cells))/2                                                                  (1)
+    log B_i = (F_i(cells) − F_i(smaller cells))/2                                                                  (1)
 
 The cells of a light split if log B_i exceeds `VERY_STRONG`; then materials and lights are fitted anew.  This uses all
 fitted observations.  The few that are held out decide differently from draw to draw: on three exact spheres they refuse

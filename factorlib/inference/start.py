@@ -11,8 +11,9 @@ Earlier   Materials are identified by name, and lights by the name of their illu
           Groups that a new photo links therefore share one gauge, and new materials are on the same scale as known
           ones.  A new photo of a known light gets the exposure that explains its mean radiance.  A new light is
           constant.  A light that explains its photos worse than a constant one counts as new: it was taken again, or
-          rotated, or is in other units.  Only the start and the decisions on shadows and interreflection are taken
-          over; no prior pulls toward the earlier answer.
+          rotated, or is in other units.  The decisions on shadows and interreflection are taken over.  A
+          light that is continued also keeps its suns, tone curves and distance, which are not tested again.  No prior
+          pulls toward the earlier answer.
 Known     Each component is brought to the scale of its known materials, which are then inserted.
 """
 

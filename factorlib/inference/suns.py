@@ -3,8 +3,9 @@
 The sun's disc is half a degree wide and holds a quarter to two thirds of the light where it shines.  Cells spread that
 energy over all directions that the observations cannot distinguish, ten degrees and more.  An object in such a light
 has no crisp shadow.  The observations determine direction and energy far better than width, and the width of the sun is
-known.  Two lights are therefore compared (`replace_brightest`).  In both, cells within `DISC_RADIUS` of the brightest
-direction take the radiance of their surroundings, and one lobe is added.  The lobe is as narrow as the sun, or as wide
+known.  Three lights are therefore compared: cells alone, cells with a sun, and, if that is accepted, cells with a wide
+lobe in its place (`replace_brightest`).  In the latter two, cells within `DISC_RADIUS` of the brightest direction take
+the radiance of their surroundings, and one lobe is added.  The lobe is as narrow as the sun, or as wide
 (`WIDE_SHARPNESS`) as a window or a lamp.  Its direction z and its weight w ≥ 0 minimise
 
     Σ_i t_i² (r_i + A_i(z) w)²                                                                                       (1)

@@ -80,8 +80,8 @@ class SurfaceEstimate(msgspec.Struct, frozen=True):
 
     Attributes:
         beginning: Fit on few cells to the meshes as they are, from which a solve starts.
-        evidence: Decision on turns, by held-out observations of held-out photos.
-        painted: Decision on detail of reflectance, likewise.
+        evidence: Decision on turns, by the log Bayes factor of left-out photos.
+        painted: Decision on log factors, by likelihood and held-out observations of left-out photos.
         stiffness: Stiffness of the chosen detail.
         gains: Decrease of −2 log marginal likelihood of each held-out photo by the kept detail.
         displacements: Displacements at the nodes of each moved mesh, in units of the mesh's extent.

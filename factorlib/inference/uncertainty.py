@@ -1,9 +1,9 @@
 """Standard errors of materials and lights in a fixed gauge, including errors of the model.
 
 Materials   Let S be the materials' information with all lights eliminated.  Let s_k be the score of cluster k of
-            observations: its part of the gradient, less the part that the lights absorb.  For residuals of independent
-            noise the covariance would be σ² S⁻¹.  Too coarse cells, too few lobes or wrong normals make neighbouring
-            residuals correlated.  The sandwich
+            observations: its part of the gradient, less the part that the lights absorb.  Residuals are whitened and
+            divided by √T, so that for independent noise the covariance would be S⁻¹.  Too coarse cells, too few lobes
+            or wrong normals make neighbouring residuals correlated.  The sandwich
 
                 S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                   (1)
 
@@ -19,8 +19,8 @@ Gauge       The data leave one factor per channel and component free, so an erro
             projected.  Surfaces that light each other determine the factor too, but badly: on data/eames and similar
             synthetic sets it is off by 7 to 50 %.
 
-Joint       For a joint solve (`Posterior`), S comes from the system of φ (`factorlib.inference.likelihood`), by
-            reflectances: by their logarithms, a zero reflectance would look exactly known.
+Variables   S comes from the system of φ (`factorlib.inference.likelihood`), with respect to reflectances: with respect
+            to their logarithms, a zero reflectance would look exactly known.
 
 Model       More observations do not remove errors of the model itself, mostly of the mesh.  MODEL_ERROR is therefore
             added in quadrature, in proportion to the residuals.
@@ -76,7 +76,9 @@ LARGEST_RELATIVE_ERROR = 1000.0  # upper limit in these maps
 def estimate_uncertainty(
     solution: Solution, problem: JointProblem, options: SolveOptions, tick: Callable[[], None] = lambda: None
 ) -> tuple[MaterialErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
-    """Return the standard errors of the materials in the gauge of the answer, and maps of each light's relative errors.
+    """Return the standard errors of the materials, scaled as the answer is, and maps of each light's relative errors.
+
+    What is held fixed is the sum of the module docstring's paragraph on the gauge, and not the gauge of the answer.
 
     Args:
         solution: Result of the solver.
@@ -90,7 +92,7 @@ def estimate_uncertainty(
     if not len(errors.materials):  # of the paper's solver, which has no prior
         sample = reliable_observations(problem).subsample(solution.observations, options.seed)
         errors = Posterior(sample, solution.materials, prior, tick).standard_errors()
-    # from the gauge of the fit to that of the answer
+    # errors in proportion to reflectances, whose scale is that of the answer
     fitted = np.maximum(solution.fit.point.materials.rows(), LEAST_REFLECTANCE)
     in_gauge = errors.materials.rows() * (solution.point.materials.rows() / fitted)
     errors = msgspec.structs.replace(errors, materials=Materials.from_rows(in_gauge))
@@ -155,7 +157,7 @@ class Posterior:
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
-        # residuals of noise alone have a deviation of 1; only the excess is an error of the model
+        # the part of MODEL_ERROR beyond 1 σ lets the prior move the estimate; that up to 1 σ only widens the error
         noise = min(deviation, 1.0)
         excess = np.sqrt(deviation**2 - noise**2)
         posteriors = []

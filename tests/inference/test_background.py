@@ -80,13 +80,18 @@ def log_scale(solution) -> float:
     return abs(np.median(np.log(solution.point.materials.diffuse / MATERIALS.diffuse)))
 
 
+def darkened(block):
+    """The block with a black background."""
+    background = msgspec.structs.replace(block.background, radiance=block.background.radiance * 2e-3)
+    return msgspec.structs.replace(block, background=background)
+
+
 def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_left_out(lit):
     solution = solve(lit, start_from_photos(3), QUICK)
     assert [each.accepted for each in solution.backgrounds] == [True] * 3
     error = log_scale(solution)
     assert error < 0.2
-    black = msgspec.structs.replace(lit.blocks[1].background, radiance=lit.blocks[1].background.radiance * 2e-3)
-    blocks = [lit.blocks[0], msgspec.structs.replace(lit.blocks[1], background=black), lit.blocks[2]]
+    blocks = [lit.blocks[0], darkened(lit.blocks[1]), lit.blocks[2]]
     solution = solve(lit.with_blocks(blocks), start_from_photos(3), QUICK)
     assert [each.accepted for each in solution.backgrounds] == [True, False, True]
     assert log_scale(solution) < 0.2
@@ -94,13 +99,20 @@ def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_
     assert not any(each.accepted for each in off.backgrounds) and log_scale(off) > error + 0.1
 
 
+def test_where_no_background_is_kept_the_answer_is_that_without_backgrounds(lit):
+    doubtful = lit.with_blocks([darkened(block) for block in lit.blocks]).keep_backgrounds([False, True, False])
+    with_one, without = (solve(each, start_from_photos(3), QUICK) for each in (doubtful, lit.without_backgrounds()))
+    assert with_one.backgrounds[1].log_bayes_factor < 0 and not with_one.backgrounds[1].accepted
+    np.testing.assert_array_equal(with_one.point.materials.rows(), without.point.materials.rows())
+
+
 def test_the_factor_of_a_component_is_free_unless_a_background_fixes_it(lit):
     names = [block.name for block in lit.blocks]
     assert not has_free_factor(lit.blocks, names)
-    assert has_free_factor(lit.with_backgrounds().blocks, names)
+    assert has_free_factor(lit.without_backgrounds().blocks, names)
 
 
 def test_the_solver_of_the_paper_ignores_backgrounds_and_keeps_its_gauge(lit):
     quick = PaperOptions(lobes=4, samplings=0.5)
-    with_them, without = (solve_paper(each, 3, quick) for each in (lit, lit.with_backgrounds()))
+    with_them, without = (solve_paper(each, 3, quick) for each in (lit, lit.without_backgrounds()))
     np.testing.assert_array_equal(with_them.point.materials.rows(), without.point.materials.rows())

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference.exposures import LightTerms, balance_exposures, material_groups
+from factorlib.inference.exposures import ExposureTerms, balance_exposures, material_groups
 from factorlib.inference.fit import fit_problem
 from factorlib.inference.identifiability import before_solving
 from factorlib.inference.known import KnownValues
@@ -125,7 +125,7 @@ def test_the_slope_of_the_priors_is_that_of_their_values():
     state, _ = state_of(lamps(), (1.2, 0.9), factor=0.3)
     likelihood = state.likelihoods[0]
     stiff = msgspec.structs.replace(likelihood, precision=likelihood.precision + np.eye(len(likelihood.precision)))
-    term = LightTerms(stiff, np.array([0, 1, 2]))
+    term = ExposureTerms(stiff, np.array([0, 1, 2]))
     at, step = np.array([0.3, -0.2, 0.1]), 1e-5
     numeric = [(term.energy(at + d)[0] - term.energy(at - d)[0]) / (2 * step) for d in step * np.eye(3)]
     np.testing.assert_allclose(term.energy(at)[1], numeric, rtol=1e-5, atol=1e-4)
