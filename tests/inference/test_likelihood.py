@@ -7,10 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference import responses
 from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import fibonacci_cells
 from factorlib.inference.likelihood import EXPOSURE_DEVIATION, TONE_DEVIATION
 from factorlib.inference.material_prior import (
     MaterialPrior,
@@ -22,7 +20,7 @@ from factorlib.inference.material_prior import (
 )
 from factorlib.inference.materials import Materials
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.responses import ResponseCache, ResponseTable
+from factorlib.inference.responses import ResponseTable
 from factorlib.scenes.joint_problems import MATERIALS, sphere_block
 from tests.inference.made import none_held_out
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, likelihood, on_even_cells, photographed, spheres
@@ -188,26 +186,6 @@ def made(seed, photos=1, toned=False, hidden=False, bounced=False, clipped=False
     off = np.exp(rng.normal(0, 0.2, data.radiance.shape))
     one = Illumination(msgspec.structs.replace(data, radiance=data.radiance * off), light, materials, OPERATOR)
     return msgspec.structs.replace(one, table=ResponseTable(one.block, light.unit_lobes, OPERATOR))
-
-
-def test_tables_are_kept_as_long_as_all_fit_and_the_last_used_longest(monkeypatch):
-    block, lobes = (photographed(6, 1, cells=CELLS, size=8)[0].blocks[0], fibonacci_cells(12))
-    cache = ResponseCache()
-
-    def table(count: int) -> ResponseTable:
-        """The table of some of the observations, with its values."""
-        kept = cache.get(block.take(np.arange(len(block)) < count), lobes, OPERATOR)
-        kept.interpolate(int(block.material[0]), 0.3)
-        return kept
-
-    first, second = table(8), table(9)
-    assert table(8) is first and table(9) is second and first.nbytes > 0
-    monkeypatch.setattr(responses, "CACHED_BYTES", first.nbytes + second.nbytes)
-    assert table(8) is first and table(9) is second
-    table(10), table(11)  # the size is that before the new one has values
-    assert table(9) is not second
-    monkeypatch.setattr(responses, "CACHED_BYTES", 0)
-    assert table(9) is table(9)  # the one in use stays
 
 
 ANY = {
