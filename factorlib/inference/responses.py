@@ -38,7 +38,7 @@ NODES = np.geomspace(0.1, 1.0, 19)  # roughness of the nodes
 COARSE_SHARPNESS = 200.0  # λ up to which every second node is enough
 DEGREE = 3  # of the polynomials between nodes
 CACHED_NODES = 6  # nodes of a material whose responses stay in memory
-CACHED_BYTES = 1 << 30  # size of the tables that stay in memory
+CACHED_TABLES = 16  # tables that stay in memory, about 400 MB
 Rows = slice | Int[np.ndarray, " n"]
 
 
@@ -214,13 +214,6 @@ class ResponseTable:
         self._specular: dict[int, dict[int, np.ndarray]] = {}  # by material and node
         self._stacks: dict[int, tuple[int, np.ndarray]] = {}  # by material: the first node, and the stack from there on
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the kept values."""
-        specular = [values for nodes in list(self._specular.values()) for values in list(nodes.values())]
-        stacks = [stack for _, stack in list(self._stacks.values())]
-        return sum(values.nbytes for values in [*list(self._diffuse.values()), *specular, *stacks])
-
     def rows(self, m: int) -> slice:
         """Return the rows of material m, which are contiguous."""
         start, stop = np.searchsorted(self.block.material, [m, m + 1])
@@ -270,7 +263,7 @@ class ResponseTable:
 
 
 class ResponseCache:
-    """Cache of response tables, shared by fits; it keeps the last used, of `CACHED_BYTES` together.
+    """Cache of response tables, shared by fits; it keeps the `CACHED_TABLES` last used.
 
     Fits that compare models have the same observations and lobes.  Only radiance, materials and weights differ.
     """
@@ -304,9 +297,8 @@ class ResponseCache:
         with self._lock:
             table = self._tables.pop(key, None) or ResponseTable(block, lobes, operator, fixed_roughness is not None)
             self._tables[key] = table
-            excess = sum(kept.nbytes for kept in self._tables.values()) - CACHED_BYTES
-            while excess > 0 and len(self._tables) > 1:
-                excess -= self._tables.popitem(last=False)[1].nbytes
+            while len(self._tables) > CACHED_TABLES:
+                self._tables.popitem(last=False)
         return table
 
 
