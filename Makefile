@@ -5,7 +5,7 @@
 $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(eval override $(name) := $$(value $(name)))$(eval export $(name))))
 override export GOAL = $@
 SHELL := /bin/bash
-# Containers often set it; every process would then compile what it imports, for 3 s.
+# Containers often set it; every process would then compile what it imports.
 unexport PYTHONDONTWRITEBYTECODE
 override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)

@@ -143,7 +143,7 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
         def observe(name: str) -> list[tuple[Key, TextureSamples]]:
             """Return what a photo observes."""
             samples = list(self.observe(name, fine, keys, step))
-            self.report(f"{name}: light and highlights")
+            self.report(f"{name}: observations of paint")
             return samples
 
         observed: dict[Key, list[TextureSamples]] = {}
