@@ -60,17 +60,22 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
 
 
 def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
-    """Return shell and legs, decimated and bent by four waves of about a chair's length.
+    """Return shell and legs, decimated and bent as by `bend_parts`."""
+    return bend_parts(chair(), rng, triangles, warp)
+
+
+def bend_parts(parts: dict[str, Part], rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
+    """Return the parts of a mesh, decimated and bent by four waves of about its length.
 
     Args:
+        parts: Vertices and faces by part.
         rng: Random generator.
         triangles: Number of triangles of each part.
-        warp: Approximate largest displacement, as a share of the chair's extent.
+        warp: Approximate largest displacement, as a share of the extent of all parts.
 
     Returns:
         Vertices and faces by part.
     """
-    parts = chair()
     points = np.concatenate([vertices for vertices, _ in parts.values()])
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     axes = rng.normal(0, 5 / extent, (4, 3))

@@ -31,6 +31,8 @@ from factorlib.inference.materials import Materials
 from factorlib.inference.responses import CHUNK, ResponseLookup, Responses, diffuse_response, specular_response
 from factorlib.reflection.operator import Operator
 
+NORMAL_STEP = 0.02  # step of a normal for finite differences: about 1°
+
 
 class Prediction(NamedTuple):
     """Prediction of the model for n observations.
@@ -153,6 +155,23 @@ class Illumination(msgspec.Struct, frozen=True):
     def residuals(self) -> Float[np.ndarray, "n 3"]:
         """Return the residuals r of all observations, in σ of the noise model."""
         return self.block.residuals(self.radiance())
+
+    def by_normal(self) -> Float[np.ndarray, "n 3 3"]:
+        """Return ∂r/∂n of each observation, channel by axis, in the tangent plane of its normal."""
+        operated = msgspec.structs.replace(self, table=None)  # tables hold for the block's own normals
+        residual_before = operated.residuals()
+        normal = self.block.normal
+        # two tangents, and finite differences of the residuals along each
+        tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        result = np.zeros((len(normal), 3, 3))
+        for direction in (tangent, np.cross(normal, tangent)):
+            turned = normal + NORMAL_STEP * direction
+            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+            block = msgspec.structs.replace(self.block, normal=turned)
+            residual_after = msgspec.structs.replace(operated, block=block).residuals()
+            result += ((residual_after - residual_before) / NORMAL_STEP)[:, :, None] * direction[:, None, :]
+        return result
 
     def losses(self, loss: RobustLoss) -> Float[np.ndarray, " n"]:
         """Return the robust loss of every observation, averaged over its channels."""

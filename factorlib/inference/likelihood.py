@@ -60,6 +60,19 @@ EXPOSURE_DEVIATION = 0.35
 TONE_DEVIATION = 0.3  # standard deviation of a log tone exponent
 
 
+class Grouping(NamedTuple):
+    """Groups of observations, and a change of their residuals.
+
+    Attributes:
+        group: Number of each observation's group, from 0.
+        change: Change of the residuals, whitened, weighted by the robust loss and divided by √T; None for the residuals
+            themselves.
+    """
+
+    group: Int[np.ndarray, " n"]
+    change: Float[np.ndarray, "n 3"] | None = None
+
+
 class System(NamedTuple):
     """Contribution of one illumination to the objective, half its gradient and half its Gauss–Newton Hessian.
 
@@ -78,8 +91,8 @@ class System(NamedTuple):
         determinant_by_materials: Half the gradient of log det H with respect to materials.
         determinant_hessian: Half its Hessian with respect to materials.
         determinant_by_light: Half the gradient of log det H with respect to the light; it acts on materials only.
-        scores: Contributions to the gradient, materials then light, one row a cluster of observations; None if not
-            requested.
+        scores: For each requested grouping of the observations, their contributions to the gradient, materials then
+            light, one row a group.
     """
 
     value: float
@@ -94,7 +107,7 @@ class System(NamedTuple):
     determinant_by_materials: Float[np.ndarray, " k"]
     determinant_hessian: Float[np.ndarray, "k k"]
     determinant_by_light: Float[np.ndarray, " l"]
-    scores: Float[np.ndarray, "g k+l"] | None = None
+    scores: tuple[Float[np.ndarray, "g k+l"], ...] = ()
 
 
 class LightLikelihood(msgspec.Struct, frozen=True):
@@ -144,12 +157,12 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         value, slope = self._prior()
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
-    def normal_equations(self, materials_given: bool = False, clusters: Int[np.ndarray, " n"] | None = None) -> System:
+    def normal_equations(self, materials_given: bool = False, groupings: Sequence[Grouping] = ()) -> System:
         """Return the value of (1) and its normal equations.
 
         Args:
             materials_given: True to return φ instead of (1), without the costly derivatives of the determinants.
-            clusters: Number of each observation's cluster, from 0, for `System.scores`.
+            groupings: Groups of observations, for `System.scores`.
         """
         illumination = self.illumination
         prediction = illumination.predict()
@@ -187,7 +200,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         if not materials_given:
             value += self._determinants(factor)
             determinant = _determinant_derivatives(parts, factor, places, illumination)
-        scores = None if clusters is None else _scores(parts, clusters, places, size)
+        scores = tuple(_scores(parts, grouping, places, size) for grouping in groupings)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
     def marginal(self, system: System) -> float:
@@ -234,22 +247,24 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 
 
 def _scores(
-    parts: Sequence[Linearised], clusters: Int[np.ndarray, " n"], places: Int[np.ndarray, " k"], size: int
+    parts: Sequence[Linearised], grouping: Grouping, places: Int[np.ndarray, " k"], size: int
 ) -> Float[np.ndarray, "g k+l"]:
-    """Return the sum over each cluster of every derivative times its residual.
+    """Return the sum over each group of every derivative times its residual, or times a change of it.
 
     Args:
         parts: All channels and materials of a light.
-        clusters: Number of each observation's cluster, from 0.
+        grouping: Groups of observations.
         places: Numbers of the materials' unknowns.
         size: l, number of the light's unknowns.
     """
     k = len(places)
-    scores = np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
+    group, change = grouping
+    scores = np.zeros((int(group.max(initial=-1)) + 1, k + size))
     for part in parts:
         p = part.diffuse.shape[1]
         start = k + part.channel * p
-        summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
+        residual = part.residual if change is None else change[part.rows, part.channel]
+        summing = (group[part.rows] == np.arange(len(scores))[:, None]) * residual
         scores[:, np.searchsorted(places, part.places)] += summing @ part.by_material
         scores[:, start : start + p] += summing @ (part.diffuse + part.specular)
         scores[:, k + 3 * p :] += summing @ part.by_photo

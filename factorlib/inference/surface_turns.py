@@ -41,7 +41,6 @@ from factorlib.meshes.mesh import scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh
 from factorlib.results.poses import ObjectPose
 
-NORMAL_STEP = 0.02  # step of a normal for finite differences: about 1°
 LARGEST_TURN = 0.6  # largest |n' − n|: 35°
 LEAST_VIEW_COSINE = 0.05  # least n'·o: a normal that would turn further stays as it is
 PULL_SHARE = 0.06  # b/a, which fixes nodes without observations nearby
@@ -318,7 +317,7 @@ def linearise_light(
     whitened = illumination.block.residuals(prediction.radiance)
     weight = tabulated.root_weights(whitened, FIT_LOSS, hyperparameters.temperature)
     # J = [∂r/∂n R b, ∂r/∂log k_d b]
-    slopes = (_normal_derivatives(illumination) * weight[:, :, None]).reshape(3 * n, 3)
+    slopes = (illumination.by_normal() * weight[:, :, None]).reshape(3 * n, 3)
     factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)
     columns = 3 * attached.node.repeat(3, axis=0) + np.tile(np.arange(3), n)[:, None]
     painted = csr_array((factors.reshape(-1), (np.arange(3 * n).repeat(3), columns.reshape(-1))), (3 * n, 3 * nodes))
@@ -331,23 +330,6 @@ def _block_diagonal(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:
     rows = np.arange(len(slopes))
     columns = 3 * (rows // 3)[:, None] + np.arange(3)
     return csr_array((slopes.reshape(-1), (np.repeat(rows, 3), columns.reshape(-1))), (len(slopes), len(slopes)))
-
-
-def _normal_derivatives(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
-    """Return ∂r/∂n of each observation, channel by axis, in the tangent plane of the normal."""
-    residual_before = illumination.residuals()
-    # two tangents, and finite differences of the residuals along each
-    tangent_1 = np.cross(illumination.block.normal, np.eye(3)[np.abs(illumination.block.normal).argmin(1)])
-    tangent_1 /= np.linalg.norm(tangent_1, axis=1, keepdims=True)
-    result = np.zeros((len(illumination.block), 3, 3))
-    for tangent in (tangent_1, np.cross(illumination.block.normal, tangent_1)):
-        turned = illumination.block.normal + NORMAL_STEP * tangent
-        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-        residual_after = msgspec.structs.replace(
-            illumination, block=msgspec.structs.replace(illumination.block, normal=turned)
-        ).residuals()
-        result += ((residual_after - residual_before) / NORMAL_STEP)[:, :, None] * tangent[:, None, :]
-    return result
 
 
 class Stiffness(msgspec.Struct, frozen=True):

@@ -22,6 +22,15 @@ Gauge       The data leave one factor per channel and component free, so an erro
 Variables   S comes from the system of φ (`factorlib.inference.likelihood`), with respect to reflectances: with respect
             to their logarithms, a zero reflectance would look exactly known.
 
+Normals     On thin and coarse parts normals are wrong together, which residuals do not show: lights and roughness
+            explain them.  A normal of confidence c (`factorlib.align.reliability`) has the variance
+
+                NORMAL_ERROR² (1/c − 1)                                                                              (2)
+
+            beyond that of a sure one.  Let the normals of one material in one photo turn by it about each axis, all
+            together, and let d_k be the change of the score by turn k, less the part that the lights absorb.  Materials
+            then have the further covariance S⁻¹ (Σ_k d_k d_kᵀ) S⁻¹.
+
 Model       More observations do not remove errors of the model itself, mostly of the mesh.  MODEL_ERROR is therefore
             added in quadrature, in proportion to the residuals.
 
@@ -35,6 +44,7 @@ Lights      Given the materials, log radiance of a light has the covariance Σ =
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,7 +57,14 @@ from factorlib.inference.fit import Fit, Hyperparameters, light_likelihood, reli
 from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.likelihood import System, cholesky_factor, cholesky_inverse, solve_cholesky
+from factorlib.inference.likelihood import (
+    Grouping,
+    LightLikelihood,
+    System,
+    cholesky_factor,
+    cholesky_inverse,
+    solve_cholesky,
+)
 from factorlib.inference.material_posterior import material_posterior
 from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, MaterialErrors, Materials, Point
@@ -69,6 +86,10 @@ WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a 
 # (data/eames and the synthetic sets of seeds 11, 12 and 13); without them 35, 32, 45 and 57 % do.
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.07])
 LIGHT_ERROR = 0.7
+# Standard deviation of normals of (2), radians.  On made chairs, whose true normals are known, errors of thin legs are
+# 2.0° over the root of their confidence (median; 2.0° is 1.7° an axis), of which a part is common to all.
+NORMAL_ERROR = np.radians(1.5)
+LEAST_CONFIDENCE = 0.02  # of a normal: a smaller one counts as this
 COVERAGE_ROWS = 32  # rows of the maps of a light's relative standard errors
 LARGEST_RELATIVE_ERROR = 1000.0  # upper limit in these maps
 
@@ -100,6 +121,20 @@ def estimate_uncertainty(
     return errors, Posterior(light_sample, solution.fit, prior, tick).relative_standard_errors()
 
 
+class MaterialCovariance(NamedTuple):
+    """Covariance of reflectances and roughnesses, in the gauge.
+
+    Attributes:
+        by_data: That by the observations; (1), or that of independent noise.
+        by_normals: That by errors of normals, (2).
+        deviation: Deviation of the whitened residuals.
+    """
+
+    by_data: Float[np.ndarray, "k k"]
+    by_normals: Float[np.ndarray, "k k"]
+    deviation: float
+
+
 class Posterior:
     """Posterior of materials and lights at the fit of a joint solve.
 
@@ -122,50 +157,57 @@ class Posterior:
 
         def system(pair: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
-            clusters = pair[0].block.clusters() if with_scores else None
-            result = light_likelihood(*pair, self.prior, not with_scores, self.problem.tables).normal_equations(
-                materials_given=True, clusters=clusters
-            )
+            likelihood = light_likelihood(*pair, self.prior, not with_scores, self.problem.tables)
+            groupings = []
+            if with_scores:
+                groupings = [Grouping(pair[0].block.clusters()), *normal_turns(likelihood)]
+            result = likelihood.normal_equations(materials_given=True, groupings=groupings)
             self.tick()
             return result
 
         illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
-    def covariance(self) -> tuple[Float[np.ndarray, "k k"], float]:
-        """Return the covariance of reflectances and roughnesses by the observations, and the residuals' deviation."""
+    def covariance(self) -> MaterialCovariance:
+        """Return the covariance of reflectances and roughnesses."""
         materials = self.materials
         values = by_unknowns(materials).reshape(-1)
-        # S and s_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
+        # S, s_k and d_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
         precision, scores = information(self.systems(with_scores=True), len(values))
-        scores = [light_scores / values for light_scores in scores]
-        covariance = widest_covariance(precision / np.outer(values, values), scores, materials, self.problem)
-        return covariance, residual_deviation(self.problem, self.fit.point)
+        clusters = [light_scores[0] / values for light_scores in scores]
+        inverse = regularised_inverse(precision / np.outer(values, values), materials, self.problem)
+        covariance = widest_covariance(inverse, clusters, materials, self.problem)
+        turns = [turn / values for light_scores in scores for turn in light_scores[1:]]
+        by_turns = np.vstack([np.zeros((0, len(values))), *turns]) @ inverse
+        normals = project_to_gauge(by_turns.T @ by_turns, materials, self.problem)
+        return MaterialCovariance(covariance, normals, residual_deviation(self.problem, self.fit.point))
 
     def standard_errors(self) -> MaterialErrors:
         """Return the standard error of every material unknown by the observations alone."""
-        covariance, deviation = self.covariance()
+        by_data, by_normals, deviation = self.covariance()
         free = self.problem.known.free(len(self.materials)).reshape(-1, 7)
         model_errors = free * deviation * MODEL_ERROR * by_unknowns(self.materials)
         # an error is at most the width of its unknown's range
-        errors = np.minimum(np.hypot(np.sqrt(np.diag(covariance).reshape(-1, 7)), model_errors), WIDTHS)
+        errors = np.minimum(np.hypot(np.sqrt(np.diag(by_data + by_normals).reshape(-1, 7)), model_errors), WIDTHS)
         return MaterialErrors(Materials.from_rows(errors), deviation, np.zeros_like(errors))
 
     def with_prior(self) -> tuple[Materials, MaterialErrors]:
         """Return the materials by `factorlib.inference.material_posterior`, and their standard errors."""
-        covariance, deviation = self.covariance()
+        by_data, by_normals, deviation = self.covariance()
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
-        # the part of MODEL_ERROR beyond 1 σ lets the prior move the estimate; that up to 1 σ only widens the error
+        # normals, and the part of MODEL_ERROR beyond 1 σ, let the prior move the estimate; its part up to 1 σ only
+        # widens the error
         noise = min(deviation, 1.0)
         excess = np.sqrt(deviation**2 - noise**2)
         posteriors = []
         for m, theta in enumerate(unknowns):
             rows = slice(7 * m, 7 * m + 7)
-            by_logs = covariance[rows, rows] / np.outer(values[m], values[m])
+            data, normals = (each[rows, rows] / np.outer(values[m], values[m]) for each in (by_data, by_normals))
             name = self.problem.known.classes.get(m)
-            posteriors.append(material_posterior(theta, by_logs, excess * MODEL_ERROR, free[m], name))
+            model = normals + np.diag((excess * MODEL_ERROR) ** 2)
+            posteriors.append(material_posterior(theta, data, model, free[m], name))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
         deviations = np.hypot([posterior.deviation for posterior in posteriors], free * noise * MODEL_ERROR)
         errors = np.minimum(deviations * by_unknowns(materials), WIDTHS)
@@ -207,18 +249,35 @@ def by_unknowns(materials: Materials) -> Float[np.ndarray, "m 7"]:
     return np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
 
 
+def normal_turns(likelihood: LightLikelihood) -> list[Grouping]:
+    """Return the changes of one light's residuals by turns of normals about each axis, grouped by photo and material.
+
+    Turns are the standard deviation of (2).
+    """
+    block = likelihood.illumination.block
+    if block.confidence is None:
+        return []
+    unsure = np.sqrt(1 / np.maximum(block.confidence, LEAST_CONFIDENCE) - 1)
+    weight = likelihood.illumination.root_weights(
+        likelihood.illumination.residuals(), likelihood.loss, likelihood.temperature
+    )
+    slopes = likelihood.illumination.by_normal() * weight[:, :, None]
+    group = np.unique(np.column_stack([block.photo, block.material]), axis=0, return_inverse=True)[1].reshape(-1)
+    turned = [NORMAL_ERROR * unsure[:, None] * np.cross(axis, block.normal) for axis in np.eye(3)]
+    return [Grouping(group, np.einsum("ncx,nx->nc", slopes, turn)) for turn in turned]
+
+
 def information(
     systems: Sequence[System], size: int
-) -> tuple[Float[np.ndarray, "k k"], list[Float[np.ndarray, "g k"]]]:
-    """Return the materials' information and the scores of clusters, with the lights eliminated.
+) -> tuple[Float[np.ndarray, "k k"], list[list[Float[np.ndarray, "g k"]]]]:
+    """Return the materials' information and the scores of groups, with the lights eliminated.
 
     Args:
         systems: Contribution of each light.
         size: Number of material unknowns.
 
     Returns:
-        S [size, size], and for each light with scores their values s_k [g, size], less the part that the light
-        absorbs.
+        S [size, size], and for each light its scores by grouping [g, size], less the part that the light absorbs.
     """
     hessian = np.zeros((size, size))
     scores = []
@@ -226,11 +285,11 @@ def information(
         coupling = solve_cholesky(part.factor, part.cross_hessian.T)
         # Σ M − C_i L_i⁻¹ C_iᵀ
         hessian[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
-        if part.scores is not None:
-            k = len(part.places)
-            scores.append(np.zeros((len(part.scores), size)))
+        k = len(part.places)
+        scores.append([np.zeros((len(values), size)) for values in part.scores])
+        for reduced, values in zip(scores[-1], part.scores, strict=True):
             # s_m − s_l L_i⁻¹ C_iᵀ
-            scores[-1][:, part.places] = part.scores[:, :k] - part.scores[:, k:] @ coupling
+            reduced[:, part.places] = values[:, :k] - values[:, k:] @ coupling
     return (hessian + hessian.T) / 2, scores
 
 
@@ -244,15 +303,10 @@ def residual_deviation(problem: JointProblem, point: Point) -> float:
     return robust_deviation(residuals if len(residuals) else np.concatenate([residual for residual, _ in pairs]))
 
 
-def widest_covariance(
-    information: Float[np.ndarray, "k k"],
-    scores: Sequence[Float[np.ndarray, "g k"]],
-    materials: Materials,
-    problem: JointProblem,
+def regularised_inverse(
+    information: Float[np.ndarray, "k k"], materials: Materials, problem: JointProblem
 ) -> Float[np.ndarray, "k k"]:
-    """Return the covariance in the gauge with the largest of three variances of each unknown; 0 for known ones.
-
-    Correlations are those of independent noise.
+    """Return the covariance S⁻¹ of independent noise; 0 for known unknowns.
 
     The data may leave unknowns undetermined, such as the roughness of a Lambertian material, or a trade of one unknown
     for another.  The variance of such an unknown is that of the width of its range, which counts as one more
@@ -260,7 +314,6 @@ def widest_covariance(
 
     Args:
         information: S of the materials; rounding may leave an eigenvalue below 0.
-        scores: s_k of each light's clusters, with the lights eliminated.
         materials: Estimated materials.
         problem: Observations.
     """
@@ -274,6 +327,25 @@ def widest_covariance(
         np.tile(WIDTHS, len(materials))[free] ** -2.0 / scale**2
     )
     inverse[np.ix_(free, free)] = cholesky_inverse(cholesky_factor(regularised)) / scales
+    return inverse
+
+
+def widest_covariance(
+    inverse: Float[np.ndarray, "k k"],
+    scores: Sequence[Float[np.ndarray, "g k"]],
+    materials: Materials,
+    problem: JointProblem,
+) -> Float[np.ndarray, "k k"]:
+    """Return the covariance in the gauge with the largest of three variances of each unknown; 0 for known ones.
+
+    Correlations are those of independent noise.
+
+    Args:
+        inverse: Covariance of independent noise.
+        scores: s_k of each light's clusters, with the lights eliminated.
+        materials: Estimated materials.
+        problem: Observations.
+    """
     light_sums = np.array([s.sum(0) for s in scores])
     covariances = inverse, sandwich(inverse, np.vstack(scores)), sandwich(inverse, light_sums)
     in_gauge = [project_to_gauge(covariance, materials, problem) for covariance in covariances]

@@ -1,4 +1,4 @@
-"""Degraded sets of chairs, from good to hopeless, for `studies.measured.verdict`.
+"""Degraded sets of chairs and of solids, from good to hopeless, for `studies.measured.verdict`.
 
 The photos, mesh, masks or links of each are degraded, by amounts that the set's number seeds.  The truth stays with the
 set.
@@ -14,11 +14,13 @@ import yaml
 from jaxtyping import Float
 from PIL import Image, ImageFilter
 
-from factorlib.generate.chair import bent_chair, chair
+from factorlib.generate.chair import bend_parts, bent_chair, chair
 from factorlib.generate.folder import write_labels, write_light, write_normals, write_obj, write_photo, write_yaml
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.tone import srgb_decode, srgb_encode
 from factorlib.meshes.mesh import smooth
+from factorlib.meshes.ply_stl_off import write_ply
+from factorlib.meshes.read_mesh import read_mesh
 
 Rng = np.random.Generator
 Spec = dict[str, Any]  # the content of dataset.yaml
@@ -57,10 +59,28 @@ def another_chair(folder: Path, spec: Spec, rng: Rng) -> None:
     write_obj(folder / MESH, {name: (v * axes, faces) for name, (v, faces) in bent_chair(rng, 80, 0.1).items()})
 
 
+def bent(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give meshes of 500 triangles, each bent by 2 % of its extent."""
+    bend_meshes(folder, rng, 500, 0.02)
+
+
+def bent_further(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give meshes of 200 triangles, each bent by 5 % of its extent."""
+    bend_meshes(folder, rng, 200, 0.05)
+
+
+def bend_meshes(folder: Path, rng: Rng, triangles: int, warp: float) -> None:
+    """Bend every mesh of a set of solids."""
+    for file in sorted((folder / "meshes").glob("*.ply")):
+        mesh = read_mesh(file, ["all"], "all")
+        vertices, faces = bend_parts({"all": (mesh.vertices, mesh.faces)}, rng, triangles, warp)["all"]
+        write_ply(file, smooth(vertices, faces))
+
+
 def few(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Keep two to four photos, and remove the others."""
+    """Keep two to four photos, but not all, and remove the others."""
     names = [photo["name"] for photo in spec["photos"]]
-    keep(spec, list(rng.permutation(names)[: rng.integers(2, 5)]))
+    keep(spec, list(rng.permutation(names)[: rng.integers(2, min(5, len(names)))]))
 
 
 def one_photo(folder: Path, spec: Spec, rng: Rng) -> None:
@@ -141,6 +161,8 @@ def shrink(file: Path, resampling: Image.Resampling) -> tuple[np.ndarray, int | 
 KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
     function.__name__: function
     for function in (
+        bent,
+        bent_further,
         exact,
         rough,
         rougher,
@@ -156,12 +178,13 @@ KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
         tiny,
     )
 }
-# Degradations of a set, one after the other; each entry is used equally often.
+# Degradations of a set of chairs, one after the other, and of one of solids; each entry is used equally often.
 MIXED = (
     [], [], ["exact"], ["exact"], ["few"], ["exact", "few"], ["rough"], ["rough", "few"], ["rougher"],
     ["another_chair"], ["one_photo"], ["one_photo", "exact"], ["unlinked"], ["miscalled"], ["clipped"],
     ["exact", "dark"], ["noisy"], ["developed"], ["tiny"], ["few", "tiny", "rougher"],
 )  # fmt: skip
+MIXED_SOLIDS = ([], ["bent"], ["bent_further"], ["bent", "few"])
 
 
 def degrade(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
@@ -182,10 +205,17 @@ def degrade(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
 def truth_of(spec: Spec, truth: Spec) -> Spec:
     """Return the truth of the remaining photos and their materials, because others are not to be scored."""
     names = [photo["name"] for photo in spec["photos"]]
-    visible = {m for photo in spec["photos"] for obj in photo["objects"] for m in ("wood", *obj["materials"].values())}
+    objects = [obj for photo in spec["photos"] for obj in photo["objects"]]
+    visible = {name for obj in objects for name in materials_of(obj, spec["meshes"][obj["mesh"]])}
     materials = {name: truth["materials"][name.removesuffix("_2")] for name in spec["materials"] if name in visible}
     by_photo = {key: {name: truth[key][name] for name in names} for key in ("illumination", "normals", "poses")}
     return {"materials": materials, **by_photo}
+
+
+def materials_of(obj: Spec, mesh: Spec) -> set[str]:
+    """Return the materials of an object with that mesh."""
+    parts = mesh.get("parts", {"all": mesh.get("material")})
+    return {*(parts | obj.get("materials", {})).values()}
 
 
 def relabel(folder: Path, photo: Spec, new: dict[int, int]) -> None:

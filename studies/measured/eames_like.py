@@ -135,14 +135,14 @@ class SetResult(NamedTuple):
         return float(np.sqrt(np.square(errors).mean())), float(np.sqrt(np.square(nulls).mean()))
 
 
-def generate_set(seed: int, lights: Path | None = None) -> Path:
+def generate_set(seed: int, lights: Path | None = None, kind: str = "eames") -> Path:
     """Return the folder of the set of a seed; generate it if it is missing or if factorlib/generate has changed."""
     sources = sorted(path for path in (ROOT / "factorlib/generate").iterdir() if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
-    folder = PLACE / digest / ("captured" if lights else "made") / f"eames-like-{seed}"
+    folder = PLACE / digest / ("captured" if lights else "made") / f"{kind}-like-{seed}"
     if not (folder / "dataset.yaml").exists():
         options = ["--seed", str(seed), "--out", str(folder), *(["--lights", str(lights)] if lights else [])]
-        subprocess.run([sys.executable, "-m", "factorlib.generate", "eames", *options], cwd=ROOT, check=True)
+        subprocess.run([sys.executable, "-m", "factorlib.generate", kind, *options], cwd=ROOT, check=True)
     return folder
 
 

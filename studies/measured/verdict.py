@@ -1,10 +1,10 @@
 """Verdicts on results, beside the truth: `LIGHTS="FOLDER …" python -m studies.measured.verdict fit test`.
 
-fit    44 sets: data/eames and seeds 111 to 120 of `studies.measured.eames_like`, from 116 on in captured light, four
-       times each, degraded in ways of `studies.measured.degradations`.  The weights of `factorlib.evaluate.verdict` are
-       fitted to them anew, and printed
-test   20 others of seeds 201 to 205, the last two in captured light, each way once: expected scores with the shipped
-       weights
+fit    26 sets: data/eames and the chairs of `studies.measured.eames_like`, half of them in captured light, twice each,
+       and four sets of solids, degraded in ways of `studies.measured.degradations`.  The weights of
+       `factorlib.evaluate.verdict` are fitted to them anew, and printed
+test   12 others: chairs of seeds 201 to 205, the last two in captured light, twice each, and two sets of solids; their
+       scores are expected with the shipped weights
 
 A set takes some minutes.  Sets lie in build/bench/verdict, results in build/.  For each kind it prints every set, rank
 correlations (Spearman), and the deviation; for `fit` also with each set left out of the fit.  Expected and true scores
@@ -23,16 +23,17 @@ from scipy.stats import spearmanr
 from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, MATERIALS, UNEXPLAINED
 from factorlib.images.light_map import maps_in
 from factorlib.wholefile import write_text
-from studies.measured.degradations import MIXED, degrade
-from studies.measured.eames_like import generate_set, link_maps, split_maps
+from studies.measured.degradations import MIXED, MIXED_SOLIDS, degrade
+from studies.measured.eames_like import CAPTURED_SEEDS, SEEDS, generate_set, link_maps, split_maps
 from studies.measured.tools import ROOT, environment_words, evaluate_dataset, markdown_table
 
 PLACE = ROOT / "build/bench/verdict"
-CAPTURED = (116, 117, 118, 119, 120, 204, 205)
-SEEDS = {"fit": (None, *range(111, 121)), "test": tuple(range(201, 206))}  # None: data/eames
+CAPTURED = (*CAPTURED_SEEDS, 204, 205)
+CHAIRS = {"fit": (None, *SEEDS, *CAPTURED_SEEDS), "test": tuple(range(201, 206))}  # None: data/eames
+SOLIDS = {"fit": (211, 212, 213, 214), "test": (215, 216)}
 FIRST = {"fit": 0, "test": 1000}  # number of the first set
 ORDER = {"fit": 5, "test": 6}  # seeds of the order of the degradations
-TIMES = 4  # a base
+TIMES = 2  # chairs of a base
 HOPELESS = 18.0  # dB: a flat disc of the true ball's mean colour scores 17.6 to 18.6
 WEIGHTS = {"materials": MATERIALS, "clipped": CLIPPED, "unexplained": UNEXPLAINED, "contour": CONTOUR}
 
@@ -50,12 +51,11 @@ class VerdictOnSet(NamedTuple):
 def measure(kind: str) -> list[VerdictOnSet]:
     """Make the degraded sets that are missing, run the pipeline on all, and read the verdicts."""
     rng = np.random.default_rng(ORDER[kind])
-    seeds = SEEDS[kind] * TIMES
-    ways = []
-    while len(ways) < len(seeds):
-        ways += [MIXED[k] for k in rng.permutation(len(MIXED))]
+    ways = [MIXED[k] for _ in range(TIMES) for k in rng.permutation(len(MIXED))]
+    degraded = list(zip(CHAIRS[kind] * TIMES, ways, strict=False))
+    degraded += list(zip(SOLIDS[kind], MIXED_SOLIDS, strict=False))
     sets = []
-    for number, (seed, names) in enumerate(zip(seeds, ways, strict=False)):
+    for number, (seed, names) in enumerate(degraded):
         folder = PLACE / f"{kind}-{number}"
         if not (folder / "dataset.yaml").exists():
             degrade(base_of(seed), folder, names, FIRST[kind] + number)
@@ -71,6 +71,8 @@ def base_of(seed: int | None) -> Path:
     """Return the folder of the set that is degraded."""
     if seed is None:
         return ROOT / "data/eames"
+    if any(seed in seeds for seeds in SOLIDS.values()):
+        return generate_set(seed, kind="synthetic")
     if seed not in CAPTURED:
         return generate_set(seed)
     maps = maps_in([Path(word) for word in environment_words("LIGHTS", "folders of captured lights")])
@@ -103,19 +105,19 @@ def agreement(predicted: Float[np.ndarray, " n"], sets: list[VerdictOnSet]) -> s
 
 def main() -> None:
     """Print the verdicts on the kinds of sets named on the command line, and write the scores of all."""
-    kinds = {kind: measure(kind) for kind in sys.argv[1:] or SEEDS}
+    kinds = {kind: measure(kind) for kind in sys.argv[1:] or CHAIRS}
     for kind, sets in kinds.items():
-        ranked = sorted(sets, key=lambda each: -each.expected)
-        rows = [[each.degradations, f"{each.score:.1f}", f"{each.expected:.1f}", each.trust] for each in ranked]
+        ranked = sorted(sets, key=lambda each: -each.expected_psnr)
+        rows = [[each.degradations, f"{each.score:.1f}", f"{each.expected_psnr:.1f}", each.trust] for each in ranked]
         print(f"{kind}\n{markdown_table(['degraded by', 'relit, dB', 'expected', 'verdict'], rows)}")
-        print(agreement(np.array([each.expected for each in sets]), sets))
+        print(agreement(np.array([each.expected_psnr for each in sets]), sets))
     if sets := kinds.get("fit"):
         print("weights:", dict(zip(WEIGHTS, np.round(fit_weights(sets), 4).tolist(), strict=True)))
         left_out = [
             expected_psnr(fit_weights([*sets[:k], *sets[k + 1 :]]), np.array(s.terms)) for k, s in enumerate(sets)
         ]
         print("each set left out of the fit:", agreement(np.array(left_out), sets))
-    lines = [f"{kind},{each.expected:.3f},{each.score:.3f}" for kind, sets in kinds.items() for each in sets]
+    lines = [f"{kind},{each.expected_psnr:.3f},{each.score:.3f}" for kind, sets in kinds.items() for each in sets]
     write_text(PLACE / "calibration.csv", "\n".join(["kind,expected_db,true_db", *lines, ""]))
 
 

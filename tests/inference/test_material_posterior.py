@@ -11,8 +11,8 @@ ENAMEL = np.array([*np.log([0.3, 0.2, 0.1]), *np.log([0.2, 0.2, 0.2]), 0.12])
 ALL = np.ones(7, bool)
 CLASSES = Mixture(shipped_classes().classes, one_tint=False)
 
-
-NO_ERROR = np.zeros(7)
+NO_ERROR = np.zeros((7, 7))
+WRONG = np.diag([0.0] * 3 + [900.0] * 4)  # errors of the model that leave k_s and roughness unknown
 
 
 def covariance(deviation, correlation: float = 0.0) -> np.ndarray:
@@ -49,7 +49,7 @@ def test_without_errors_of_the_model_a_fit_under_the_prior_stays(seed):
 
 
 def test_where_the_model_is_wrong_the_material_is_a_likely_one():
-    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [0.01] * 4), np.array([0] * 3 + [30.0] * 4), ALL)
+    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [0.01] * 4), WRONG, ALL)
     starts = [np.append(ENAMEL[:3], mean) for mean in CLASSES.mean]
     modes = [minimize(lambda x: CLASSES.evaluate(x)[0], start, tol=1e-10).fun for start in starts]
     assert CLASSES.evaluate(posterior.theta)[0] == pytest.approx(min(modes), abs=1.0)
@@ -61,10 +61,10 @@ def test_where_the_model_is_wrong_the_material_is_a_likely_one():
 def test_no_point_of_a_search_has_less_energy(seed):
     """Where errors of the model exceed those of the observations."""
     random = np.random.default_rng(seed)
-    sigma, errors = random_covariance(seed), np.array([0.1] * 3 + [1.0] * 3 + [0.3])
+    sigma, errors = random_covariance(seed), covariance([0.1] * 3 + [1.0] * 3 + [0.3])
     posterior = material_posterior(ENAMEL, sigma, errors, ALL)
     center = ENAMEL + sigma @ CLASSES.evaluate(ENAMEL)[1]
-    precision = np.linalg.inv(sigma + np.diag(errors**2))
+    precision = np.linalg.inv(sigma + errors)
 
     def energy(x: np.ndarray) -> float:
         return (x - center) @ precision @ (x - center) + CLASSES.evaluate(x)[0]
@@ -80,7 +80,7 @@ def test_the_diffuse_part_takes_what_the_specular_part_loses():
     """Errors of the model give the prior its say, and k_d follows by the observations' correlation."""
     sigma = covariance([0.3] * 3 + [0.5] * 3 + [0.1], correlation=-0.9)
     center = ENAMEL + sigma @ CLASSES.evaluate(ENAMEL)[1]
-    off = material_posterior(ENAMEL, sigma, np.array([0.0] * 3 + [1.0] * 3 + [0.5]), ALL).theta - center
+    off = material_posterior(ENAMEL, sigma, covariance([0.0] * 3 + [1.0] * 3 + [0.5]), ALL).theta - center
     share = sigma[0, 3] / (sigma[3, 3] + 1.0)
     assert (off[3:6] < -0.2).all()
     np.testing.assert_allclose(off[:3], share * off[3:6], rtol=1e-3)
@@ -88,7 +88,7 @@ def test_the_diffuse_part_takes_what_the_specular_part_loses():
 
 def test_known_unknowns_stay():
     free = np.array([True] * 3 + [False] * 4)
-    errors = np.full(7, 0.3)
+    errors = covariance(0.3)
     posterior = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.2), 0.0), errors, free)
     np.testing.assert_array_equal(posterior.theta, ENAMEL)
     assert (posterior.deviation[3:] == 0).all() and (posterior.prior_share == 0).all()
@@ -111,5 +111,5 @@ def test_observations_without_any_error_decide():
 
 @pytest.mark.parametrize(("name", "least", "most"), [("dielectric", 0.01, 0.06), ("metal", 0.06, 0.3)])
 def test_a_named_class_decides_where_the_model_is_wrong(name, least, most):
-    posterior = material_posterior(ENAMEL, covariance(0.01), np.array([0] * 3 + [30.0] * 4), ALL, name)
+    posterior = material_posterior(ENAMEL, covariance(0.01), WRONG, ALL, name)
     assert least < np.exp(posterior.theta[3:6].mean()) < most

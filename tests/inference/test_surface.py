@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.inference import surface_turns
+from factorlib.inference import forward, surface_turns
 from factorlib.inference.blocks import FIT_LOSS
 from factorlib.inference.fit import Hyperparameters, light_likelihood
 from factorlib.inference.materials import Point
@@ -76,7 +76,7 @@ def with_wrong_normals(problem: JointProblem, size: float) -> JointProblem:
 
 @pytest.mark.parametrize("kind", ["clipped", "bounced", "hidden"])
 def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
-    monkeypatch.setattr(surface_turns, "NORMAL_STEP", 1e-3)  # the step in use smooths what is sharper than a degree
+    monkeypatch.setattr(forward, "NORMAL_STEP", 1e-3)  # the step in use smooths what is sharper than a degree
     one, body = photos_in_a_wrong_light(kind), surfaces()
     at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
     turn, log_factor = random.normal(size=(2, body.nodes, 3))

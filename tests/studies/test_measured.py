@@ -5,12 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial import cKDTree
 
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
+from factorlib.meshes.read_mesh import read_mesh
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
-from studies.measured import gallery, results
+from studies.measured import gallery, results, verdict
+from studies.measured.degradations import degrade
 from studies.measured.eames_like import MAPS, SetResult, link_maps, split_maps
 from studies.measured.standard_errors import light_deviations, material_deviations
 from studies.measured.tools import ROOT, replace_sections
@@ -92,3 +96,37 @@ def test_deviations_between_two_runs_are_in_standard_errors_after_the_free_facto
     assert np.mean(off > 1.5) == pytest.approx((1 - np.cos(np.pi / 4)) / 2, abs=0.02)  # their share of the sphere
     with pytest.raises(InputError, match="'one' is missing"):
         material_deviations(one, written(tmp_path / "c", 0.3, 1.0, light, ("three", "four")))
+
+
+def test_weights_of_the_verdict_are_those_that_made_the_scores(tmp_path, monkeypatch, capsys):
+    """Scores that follow the formula with other weights give these weights; every set has its row and its line."""
+    weights, terms = np.array([0.1, 0.3, 0.01, 0.5]), np.random.default_rng(0).uniform(0.01, 0.1, (12, 4))
+    scores = verdict.expected_psnr(weights, terms).tolist()
+    sets = [
+        verdict.VerdictOnSet(f"way {k}", score, "good", 20.0 + k, row.tolist())
+        for k, (score, row) in enumerate(zip(scores, terms, strict=True))
+    ]
+    np.testing.assert_allclose(verdict.fit_weights(sets), weights, rtol=0.01)
+    monkeypatch.setattr(verdict, "measure", lambda kind: sets)
+    monkeypatch.setattr(verdict, "PLACE", tmp_path)
+    monkeypatch.setattr("sys.argv", ["verdict", "fit"])
+    verdict.main()
+    printed = capsys.readouterr().out
+    assert all(f"| way {k} | {score:.1f} | {20 + k:.1f} | good |" in printed for k, score in enumerate(scores))
+    lines = (tmp_path / "calibration.csv").read_text().splitlines()
+    assert lines[0] == "kind,expected_db,true_db" and len(lines) == 13
+
+
+def test_degraded_solids_keep_the_truth_of_what_they_show(tmp_path):
+    degrade(ROOT / "data/synthetic", tmp_path / "set", ["bent", "few"], 3)
+    spec, truth = (
+        yaml.safe_load((tmp_path / f"set/{name}").read_text()) for name in ("dataset.yaml", "truth/truth.yaml")
+    )
+    names = [photo["name"] for photo in spec["photos"]]
+    assert len(names) == 2 and sorted(truth["illumination"]) == sorted(truth["normals"]) == sorted(names)
+    whole, coarse = (
+        read_mesh(folder / "meshes/vase.ply", ["all"], "all") for folder in (ROOT / "data/synthetic", tmp_path / "set")
+    )
+    assert len(coarse.faces) <= 500 < len(whole.faces)
+    off = cKDTree(whole.vertices).query(coarse.vertices)[0].max() / np.linalg.norm(np.ptp(whole.vertices, axis=0))
+    assert 0.005 < off < 0.05
