@@ -31,6 +31,7 @@ from factorlib.inference.observed import (
     blocks_of_observations,
     gather_observations,
     read_backgrounds,
+    read_grounds,
     usable_observations,
 )
 from factorlib.inference.paper_solver import REPORTS, PaperOptions, Prior, Samplings
@@ -206,6 +207,7 @@ def _build_problem(
         world_from_camera=rotations,
         seed=params.seed,
         backgrounds=read_backgrounds(inputs["urm"], relative),
+        grounds=read_grounds(inputs["urm"]),
     )
     automatic: Name = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator

@@ -1,8 +1,9 @@
 """Unstructured reflectance map (URM): observations of one photo, from pixels with a known material and normal.
 
 Observations also have `visibility`, the share of light that arrives from each direction past the photo's meshes, and
-`met`, the surfaces that hide the rest.  Writes <photo>.parquet, and background/<photo>.exr: the radiance of the
-surroundings where the photo shows them, by direction from the objects.
+`met`, the surfaces that hide the rest.  Writes <photo>.parquet; background/<photo>.exr, the radiance of the
+surroundings where the photo shows them, by direction from the objects; and ground/<photo>.parquet, the shadows on the
+ground, if it is even.
 """
 
 import logging
@@ -24,6 +25,7 @@ from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.background import surrounding_radiance
 from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre
+from factorlib.urm.ground import ground_observations
 from factorlib.urm.observations import write_observations
 from factorlib.urm.reduction import merge, sample
 
@@ -74,6 +76,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     # visibility: rays from observations past all meshes of the photo
     if params.directions and len(observations):
         occluders = Occluders(list(meshes.values()), [poses.objects[each].pose for each in meshes])
+        if ground is not None:
+            shadows = ground_observations(photo, geometry, camera, ground, occluders, observations, params.directions)
+            if shadows is not None:
+                (out / "ground").mkdir()
+                write_observations(out / "ground" / f"{name}.parquet", shadows)
         visibility = occluders.visibility_at(
             camera,
             np.column_stack([observations.x, observations.y]),

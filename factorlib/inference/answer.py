@@ -172,6 +172,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
             splitting_chosen_by=solution.splitting,
             suns_chosen_by=dict(zip(lights, solution.suns)),
             background_chosen_by=dict(zip(lights, solution.backgrounds)),
+            ground_chosen_by=dict(zip(lights, solution.grounds)),
             tone={
                 photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
                 for block, light in illuminations

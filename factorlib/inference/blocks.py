@@ -96,6 +96,7 @@ class Block(msgspec.Struct, frozen=True):
         place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
         row: Index of the observation among all usable ones.
         background: Surroundings that the photos show; None if they are not used.
+        ground: Patches of the ground, whose radiance is relative to what it would be without shadows; None without.
         detail: Factor on the diffuse reflectance of each observation's material, per channel; None for 1.
     """
 
@@ -118,6 +119,7 @@ class Block(msgspec.Struct, frozen=True):
     place: Float[np.ndarray, "n 3"] | None = None
     row: Int[np.ndarray, " n"] | None = None
     background: Background | None = None
+    ground: Block | None = None
     detail: Float[np.ndarray, "n 3"] | None = None
 
     def __len__(self) -> int:
@@ -152,11 +154,12 @@ class Block(msgspec.Struct, frozen=True):
     def with_effects(self, shadows: bool, bounces: bool) -> Block:
         """Return the same observations with shadows or interreflection switched off where the argument is False.
 
-        Interreflection needs shadows.
+        Interreflection and the ground need shadows.
         """
         visibility = self.visibility if shadows else None
         bounced = self.bounced if shadows and bounces else None
-        return msgspec.structs.replace(self, visibility=visibility, bounced=bounced)
+        ground = self.ground if shadows else None
+        return msgspec.structs.replace(self, visibility=visibility, bounced=bounced, ground=ground)
 
     def with_noise(self, noise: Noise) -> Block:
         """Return the same observations under another noise model."""

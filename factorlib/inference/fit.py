@@ -31,6 +31,7 @@ from factorlib.inference.background import condition_on_background
 from factorlib.inference.blocks import FIT_LOSS, Block
 from factorlib.inference.exposures import balance_exposures
 from factorlib.inference.forward import Illumination
+from factorlib.inference.ground import ground_shadows
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
 from factorlib.inference.material_prior import MaterialPrior, material_unknowns, materials_from_unknowns
@@ -187,8 +188,13 @@ def light_likelihood(
     arguments = illumination.block, illumination.light.unit_lobes, illumination.operator
     table = (tables or ResponseCache()).get(*arguments, roughness)
     tabulated = msgspec.structs.replace(illumination, table=table)
+    shadows = illumination.block.ground
+    if shadows is not None and not illumination.light.fixed.any():
+        ground = ground_shadows(shadows, *arguments[1:])
+    else:
+        ground = None
     return with_hyperparameters(
-        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, FIT_LOSS),
+        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, FIT_LOSS, ground),
         hyperparameters,
     )
 

@@ -80,6 +80,7 @@ class SolveState(msgspec.Struct, frozen=True):
         shadows: Decision on the use of visibility.
         interreflection: Decision on light that surfaces send each other.
         backgrounds: Decision on each light's background; empty if not tried.
+        grounds: Decision on the shadows on each light's ground; empty if not tried.
         tone: Decision on each light's tone curves; empty if not tried.
         distances: Decision on each light's distance; empty if not tried.
         splitting: Decision on each splitting of the lights' cells.
@@ -93,6 +94,7 @@ class SolveState(msgspec.Struct, frozen=True):
     shadows: Decision = Decision(False)
     interreflection: Decision = Decision(False)
     backgrounds: list[Decision] = []
+    grounds: list[Decision] = []
     tone: list[Decision] = []
     distances: list[Decision] = []
     splitting: list[Decision] = []
@@ -110,9 +112,10 @@ class SolveState(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, fit=fit, materials=fit, **decisions)
 
     def effective_problem(self, problem: JointProblem) -> JointProblem:
-        """Return the problem under the chosen effects: with or without shadows, interreflection and backgrounds."""
-        accepted = [decision.accepted for decision in self.backgrounds]
-        return problem.with_effects(self.shadows.accepted, self.interreflection.accepted).keep_backgrounds(accepted)
+        """Return the problem under the chosen effects: shadows, interreflection, backgrounds and grounds, or not."""
+        backgrounds, grounds = ([each.accepted for each in made] for made in (self.backgrounds, self.grounds))
+        problem = problem.with_effects(self.shadows.accepted, self.interreflection.accepted)
+        return problem.keep_backgrounds(backgrounds).keep_grounds(grounds)
 
 
 class Solution(SolveState, frozen=True, kw_only=True):

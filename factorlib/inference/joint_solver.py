@@ -4,6 +4,7 @@ effects     Held-out observations choose shadows, and marginal likelihoods inter
             (`factorlib.inference.model_selection`).
 background  Marginal likelihoods choose the lights whose prior also uses the surroundings that photos show
             (`factorlib.inference.background`).
+ground      Shadows on the ground are observations of a light too, where they lie as the objects say.
 tone        Held-out observations choose tone curves.
 distances   Marginal likelihoods choose distances of lights.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
@@ -29,6 +30,7 @@ from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     TRIAL_CELLS,
+    choose_grounds,
     select_backgrounds,
     select_distances,
     select_effects,
@@ -109,8 +111,14 @@ def choose_backgrounds(request: SolveRequest, state: SolveState) -> SolveState:
     problem = reliable_observations(request.problem).with_effects(
         state.shadows.accepted, state.interreflection.accepted
     )
-    selection = select_backgrounds(problem, state.fit, request.options, request.run.fit)
+    selection = select_backgrounds(problem.keep_grounds([]), state.fit, request.options, request.run.fit)
     return state.with_fit(selection.fit, backgrounds=selection.evidence)
+
+
+def choose_shadows_on_grounds(request: SolveRequest, state: SolveState) -> SolveState:
+    """Choose the lights that are also observed by shadows on the ground."""
+    problem = request.problem.with_effects(state.shadows.accepted, state.interreflection.accepted)
+    return msgspec.structs.replace(state, grounds=choose_grounds(problem, state.fit, request.options))
 
 
 def choose_tone(request: SolveRequest, state: SolveState) -> SolveState:
@@ -162,6 +170,7 @@ def choose_suns(request: SolveRequest, state: SolveState) -> SolveState:
 STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
     "effects": choose_effects,
     "background": choose_backgrounds,
+    "ground": choose_shadows_on_grounds,
     "tone": choose_tone,
     "distances": choose_distances,
     "materials": fit_materials,

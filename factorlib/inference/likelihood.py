@@ -47,8 +47,9 @@ from scipy.linalg import LinAlgError, cho_solve
 from scipy.linalg.blas import ssyrk
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from factorlib.inference.blocks import RobustLoss
+from factorlib.inference.blocks import FIT_LOSS, RobustLoss
 from factorlib.inference.forward import Gradient, Illumination, Linearised
+from factorlib.inference.ground import GroundShadows
 from factorlib.inference.lights import DARKEST, Light
 from factorlib.inference.materials import Materials
 from factorlib.light.prior import LightPrior
@@ -122,6 +123,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         log_determinant: log det Q of the free cells and suns.
         temperature: T, which divides squared residuals.
         loss: Robust loss ρ.
+        ground: Shadows on the ground; None without.
     """
 
     illumination: Illumination
@@ -132,6 +134,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
     log_determinant: float
     temperature: float
     loss: RobustLoss
+    ground: GroundShadows | None = None
 
     @property
     def light(self) -> Light:
@@ -155,6 +158,10 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         """Return φ, minus twice the log posterior of the light, and half its gradient by materials and light."""
         data = self.illumination.gradient(self.loss, self.temperature)
         value, slope = self._prior()
+        if self.ground is not None:
+            shadows, by_cells = self.ground.gradient(self.light.weight, FIT_LOSS, self.temperature)
+            value += shadows
+            slope[: by_cells.size] += by_cells.T.reshape(-1)
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
     def normal_equations(self, materials_given: bool = False, groupings: Sequence[Grouping] = ()) -> System:
@@ -193,6 +200,12 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             photo_cells = part.by_photo.T @ J
             L[photos, cells] += photo_cells
             L[cells, photos] += photo_cells.T
+        if self.ground is not None:
+            value += self.ground.gradient(self.light.weight, FIT_LOSS, self.temperature)[0]
+            for c, (J, r) in enumerate(self.ground.linearise(self.light.weight, FIT_LOSS, self.temperature)):
+                cells = slice(c * p, (c + 1) * p)
+                L[cells, cells] += gram_matrix(J)
+                g_l[cells] += J.T @ r
         loss = illumination.fitted_loss(illumination.block.residuals(prediction.radiance), self.loss)
         factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))

@@ -4,6 +4,8 @@ effects     No shadows, shadows of the given meshes, or shadows with interreflec
             The first model is fitted from every start, the others from its result.  Shadows stay unless held-out
             observations are against them.  Interreflection needs shadows, and a marginal likelihood that supports it.
 background  The surroundings that photos show are observations of a light unless the objects are strongly against it.
+ground      The shadows on the ground are observations of a light if they lie where the light that the objects tell of
+            casts them.  A cut-out or a picture of a floor has none, and a wrong plane has others.
 tone        Exponents of tone curves are freed for all photos.  A light keeps its curves under three conditions: the
             evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher, and they end within the
             range of real cameras.  An exponent also fits some errors of the rest of the model, such as wrong normals.
@@ -41,6 +43,7 @@ from scipy.special import softmax
 
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
 from factorlib.inference.fit_runner import SolveState
+from factorlib.inference.ground import ground_shadows
 from factorlib.inference.materials import Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -75,6 +78,7 @@ TEMPERED_LIGHTS = FitSchedule(descents=(0, 3), temperature_factor=LIGHT_TEMPERAT
 # Log Bayes factor against a background above which it is left out.  It is three times `VERY_STRONG`, because objects
 # say little of most directions that a background shows, and the errors of the model count against it.
 BACKGROUND_DOUBT = 15.0
+LEAST_CORRELATION = 0.3  # of shadows on the ground, predicted and observed
 
 Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem, start and schedule
 
@@ -158,7 +162,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
         options: Options of the user.
         run_fit: Function that fits a model.
     """
-    sample = comparison_sample(problem, options).without_backgrounds()
+    sample = comparison_sample(problem, options).without_backgrounds().keep_grounds([])
     hidden = any(block.visibility is not None for block in problem.blocks)
     shadows = options.self_shadowing if hidden else "off"
     bounces = options.interreflection if problem.has_bounces else "off"
@@ -256,6 +260,24 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
         for keep, factor, has in zip(accepted, factors, candidates, strict=True)
     ]
     return Selection(fit, evidence)
+
+
+def choose_grounds(problem: JointProblem, fit: Fit, options: SolveOptions) -> list[Decision]:
+    """Choose the lights that are also observed by shadows on the ground.
+
+    Args:
+        problem: Observations, with the grounds of all lights.
+        fit: Fit to the objects alone.
+        options: Options of the user.
+    """
+    decisions = []
+    for block, light in zip(problem.blocks, fit.point.lights, strict=True):
+        if block.ground is None or options.ground == "off" or light.fixed.any():
+            decisions.append(Decision(False))
+            continue
+        correlation = ground_shadows(block.ground, light.unit_lobes, problem.operator).correlation(light.weight)
+        decisions.append(Decision(round(correlation, 6) >= LEAST_CORRELATION, correlation=correlation))
+    return decisions
 
 
 def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:

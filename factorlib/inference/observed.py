@@ -21,7 +21,7 @@ from factorlib.inference.blocks import Block, Noise
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.problem import Spread
 from factorlib.urm.extract import with_surface_normals
-from factorlib.urm.observations import Observations, read_observations
+from factorlib.urm.observations import Observations, concatenate, read_observations
 from factorlib.urm.reduction import merge
 
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
@@ -80,6 +80,7 @@ def blocks_of_observations(
     world_from_camera: Rotations | None = None,
     seed: int = 0,
     backgrounds: Maps | None = None,
+    grounds: Sequence[Observations] = (),
 ) -> list[Block]:
     """Return one block per illumination, in order of names, without unusable observations.
 
@@ -90,6 +91,7 @@ def blocks_of_observations(
         world_from_camera: Rotation of each photo whose illumination is fixed to the world.
         seed: Seed of the random choice of held-out cells.
         backgrounds: Maps of `read_backgrounds`.
+        grounds: Observations of `read_grounds`.
 
     Raises:
         InputError: If no usable observation is left, or all are black.
@@ -109,6 +111,7 @@ def blocks_of_observations(
     blocks = [block(usable, rows) for rows in rows_by_light if len(rows)]
     if backgrounds:
         blocks = [_with_background(block, backgrounds, world_from_camera or {}) for block in blocks]
+    blocks = [_with_ground(block, grounds, world_from_camera or {}) for block in blocks]
     return sorted(blocks, key=lambda block: block.name)
 
 
@@ -131,6 +134,21 @@ def _with_background(block: Block, maps: Maps, rotations: Rotations) -> Block:
         if photo in maps
     ]
     return msgspec.structs.replace(block, background=concatenate_backgrounds(backgrounds))
+
+
+def read_grounds(folder: Path) -> list[Observations]:
+    """Read the observations of the ground of each photo that has some, from the folder of the stage `urm`."""
+    return [read_observations(file) for file in sorted((folder / "ground").glob("*.parquet"))]
+
+
+def _with_ground(block: Block, grounds: Sequence[Observations], rotations: Rotations) -> Block:
+    """Return the block with the ground of its photos."""
+    shown = [ground for ground in grounds if ground.photos[0] in block.photos]
+    if not shown:
+        return block
+    observations = concatenate(shown)
+    ground = _block(observations, np.arange(len(observations)), block.noise, 0.0, rotations, 0)
+    return msgspec.structs.replace(block, ground=ground)
 
 
 def usable_observations(observations: Observations) -> Observations:

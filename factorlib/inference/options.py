@@ -29,6 +29,9 @@ class SolveOptions(Struct, frozen=True):
     background: Literal["auto", "off"] = "auto"
     """Surroundings that photos show, as observations of the light; auto: used unless the marginal likelihood of the
     objects is strongly against it (log Bayes factor below -15)."""
+    ground: Literal["auto", "off"] = "auto"
+    """Shadows that objects cast on the ground, as observations of the light; auto: used if they lie where the light
+    that the objects tell of casts them (correlation from 0.3 on)."""
     tone: Literal["auto", "off"] = "auto"
     """Tone curve of a photo beyond its encoding; auto: used if held-out observations support it by two standard errors
     and their loss is a quarter higher without it."""

@@ -107,9 +107,16 @@ class JointProblem(msgspec.Struct, frozen=True):
 
     def keep_backgrounds(self, keep: Sequence[bool]) -> JointProblem:
         """Return the problem with the backgrounds of those lights alone for which `keep` is True; empty for none."""
+        return self._keep("background", keep)
+
+    def keep_grounds(self, keep: Sequence[bool]) -> JointProblem:
+        """Return the problem with the grounds of those lights alone for which `keep` is True; empty for none."""
+        return self._keep("ground", keep)
+
+    def _keep(self, part: str, keep: Sequence[bool]) -> JointProblem:
+        """Return the problem without a part of those blocks for which `keep` is False."""
         pairs = zip(self.blocks, keep or [False] * len(self.blocks), strict=True)
-        blocks = [block if kept else msgspec.structs.replace(block, background=None) for block, kept in pairs]
-        return self.with_blocks(blocks)
+        return self.with_blocks([b if kept else msgspec.structs.replace(b, **{part: None}) for b, kept in pairs])
 
     def without_backgrounds(self) -> JointProblem:
         """Return the problem without backgrounds."""

@@ -64,7 +64,14 @@ def relative_positions(
     """
     if not weight.sum() > 0:
         return np.zeros((len(depth), 3))
-    # centred and divided by the weighted RMS distance
-    place = back_project(view, depth)
-    place = place - np.average(place, axis=0, weights=weight)
-    return place / max(float(np.sqrt(np.average((place**2).sum(1), weights=weight))), 1e-300)
+    points = back_project(view, depth)
+    centre, size = centre_and_size(points, weight)
+    return (points - centre) / size
+
+
+def centre_and_size(
+    points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Return the weighted centre of points and their weighted RMS distance from it; the weights have a positive sum."""
+    centre = np.average(points, axis=0, weights=weight)
+    return centre, max(float(np.sqrt(np.average(((points - centre) ** 2).sum(1), weights=weight))), 1e-300)

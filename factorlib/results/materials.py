@@ -139,6 +139,7 @@ class Decision(msgspec.Struct, frozen=True):
         held_out_loss_without: the same without it
         margin: increase of the loss without it, in standard errors
         log_bayes_factor: log marginal likelihood with it, less that without it
+        correlation: of shadows on the ground, predicted by the objects alone and observed
     """
 
     accepted: bool = msgspec.field(name="kept")
@@ -146,6 +147,7 @@ class Decision(msgspec.Struct, frozen=True):
     held_out_loss_without: float | None = None
     margin: float | None = None
     log_bayes_factor: float | None = None
+    correlation: float | None = None
 
 
 class WarmStart(msgspec.Struct, frozen=True):
@@ -167,6 +169,7 @@ class Model(msgspec.Struct, frozen=True):
         splitting_chosen_by: decision of each splitting of cells
         suns_chosen_by: decision on a sun, by illumination
         background_chosen_by: decision on the surroundings that photos show, by illumination
+        ground_chosen_by: decision on the shadows on the ground, by illumination
         tone: curves of the photos that have one
         tone_chosen_by: decision on tone curves, by illumination
         distance: distance of each light that is not at infinity, in RMS distances of a photo's points from their middle
@@ -185,6 +188,7 @@ class Model(msgspec.Struct, frozen=True):
     splitting_chosen_by: list[Decision] = []
     suns_chosen_by: dict[str, Decision] = {}
     background_chosen_by: dict[str, Decision] = {}
+    ground_chosen_by: dict[str, Decision] = {}
     tone: dict[str, Tone] = {}
     tone_chosen_by: dict[str, Decision] = {}
     distance: dict[str, Positive] = {}
