@@ -4,9 +4,10 @@ effects     Held-out observations choose shadows, and marginal likelihoods inter
             (`factorlib.inference.model_selection`).
 background  Marginal likelihoods choose the lights whose prior also uses the surroundings that photos show
             (`factorlib.inference.background`).
-ground      Shadows on the ground are observations of a light too, where they lie as the objects say.
 tone        Held-out observations choose tone curves.
 distances   Marginal likelihoods choose distances of lights.
+ground      Shadows on the ground are observations of a light too, where they lie as the objects say.  They are modelled
+            as those of an infinitely distant light, so they do not choose distances.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
 splitting   The 24 cells with most of a light's energy split in about four while the log Bayes factor for that is very
             strong (`factorlib.inference.splitting`).  In a light blurred by large cells, materials come out too smooth.
@@ -115,12 +116,6 @@ def choose_backgrounds(request: SolveRequest, state: SolveState) -> SolveState:
     return state.with_fit(selection.fit, backgrounds=selection.evidence)
 
 
-def choose_shadows_on_grounds(request: SolveRequest, state: SolveState) -> SolveState:
-    """Choose the lights that are also observed by shadows on the ground."""
-    problem = request.problem.with_effects(state.shadows.accepted, state.interreflection.accepted)
-    return msgspec.structs.replace(state, grounds=choose_grounds(problem, state.fit, request.options))
-
-
 def choose_tone(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose by held-out observations which lights get tone curves, and fit them."""
     selection = select_tone_curves(request.reliable_problem(state), state.fit, request.options, request.run.fit)
@@ -131,6 +126,12 @@ def choose_distances(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose by marginal likelihood which lights are at a finite distance, and fit their distances."""
     selection = select_distances(request.reliable_problem(state), state.fit, request.options, request.run.fit)
     return state.with_fit(selection.fit, distances=selection.evidence)
+
+
+def choose_shadows_on_grounds(request: SolveRequest, state: SolveState) -> SolveState:
+    """Choose the lights that are also observed by shadows on the ground."""
+    problem = request.problem.with_effects(state.shadows.accepted, state.interreflection.accepted)
+    return msgspec.structs.replace(state, grounds=choose_grounds(problem, state.fit, request.options))
 
 
 def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
@@ -170,9 +171,9 @@ def choose_suns(request: SolveRequest, state: SolveState) -> SolveState:
 STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
     "effects": choose_effects,
     "background": choose_backgrounds,
-    "ground": choose_shadows_on_grounds,
     "tone": choose_tone,
     "distances": choose_distances,
+    "ground": choose_shadows_on_grounds,
     "materials": fit_materials,
     "splitting": choose_splittings,
     "prior": apply_prior,

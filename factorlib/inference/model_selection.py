@@ -4,13 +4,13 @@ effects     No shadows, shadows of the given meshes, or shadows with interreflec
             The first model is fitted from every start, the others from its result.  Shadows stay unless held-out
             observations are against them.  Interreflection needs shadows, and a marginal likelihood that supports it.
 background  The surroundings that photos show are observations of a light unless the objects are strongly against it.
-ground      The shadows on the ground are observations of a light if they lie where the light that the objects tell of
-            casts them.  A cut-out or a picture of a floor has none, and a wrong plane has others.
 tone        Exponents of tone curves are freed for all photos.  A light keeps its curves under three conditions: the
             evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher, and they end within the
             range of real cameras.  An exponent also fits some errors of the rest of the model, such as wrong normals.
 distance    The marginal likelihoods of a light at infinity and at `CURVATURES` decide.  They use all fitted
             observations; the few that are held out decide differently from draw to draw.
+ground      The shadows on the ground are observations of a light if they lie where the light that the objects tell of
+            casts them.  A cut-out or a picture of a floor has none, and a wrong plane has others.
 roughness   With few materials, the start decides which local minimum a fit reaches: a smooth surface in soft light
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
