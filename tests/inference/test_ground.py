@@ -3,21 +3,26 @@
 import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.blocks import FIT_LOSS, Block
+from factorlib.inference.blocks import FIT_LOSS, Block, Noise
 from factorlib.inference.fit import Hyperparameters, initial_fit, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.inference.ground import GroundShadows, ground_shadows
+from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import choose_grounds
+from factorlib.inference.observed import blocks_of_observations, read_grounds
 from factorlib.inference.optimizer import descend_light, step_light
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.start import constant_light
-from factorlib.scenes.joint_problems import MATERIALS
+from factorlib.inference.start import constant_light, start_from_photos
+from factorlib.scenes.joint_problems import MATERIALS, observations_from_front, sphere_normals
+from factorlib.urm.observations import concatenate, write_observations
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, on_even_cells, photographed
 
 K, CELLS = 512, 120
+QUICK = SolveOptions(cells=60, splittings=0, observations=300, tone="off", distance="off", self_shadowing="on")
 UP = np.array([0.1, -0.9, -0.4]) / np.linalg.norm([0.1, -0.9, -0.4])
 
 
@@ -121,3 +126,47 @@ def test_shadows_count_only_where_the_objects_expect_them():
 def test_a_ground_without_any_shadow_has_no_correlation():
     one = np.ones((5, 3))
     assert GroundShadows(np.ones((5, 2)), np.ones((5, 2)), one, one).correlation(np.ones((2, 3))) == 0
+
+
+def test_a_ground_is_read_and_turns_with_its_camera(tmp_path):
+    light = on_even_cells(drawn(3, CELLS))
+    shown, turn = floor(light), Rotation.from_rotvec([0.2, 0.5, -0.3]).as_matrix()
+    ground = observations_from_front(
+        shown.normal, shown.radiance, shown.material, ("ground",), "a", visibility=shown.visibility
+    )
+    (tmp_path / "ground").mkdir()
+    write_observations(tmp_path / "ground/a.parquet", ground)
+    normals = sphere_normals(8)
+    red = np.zeros(len(normals), int)
+    objects = concatenate(
+        [observations_from_front(normals, np.ones_like(normals), red, ("red",), name) for name in "ab"]
+    )
+    with_ground, without = blocks_of_observations(
+        objects, Noise(), world_from_camera={"a": turn}, grounds=read_grounds(tmp_path)
+    )
+    assert without.ground is None
+    np.testing.assert_allclose(with_ground.ground.normal, shown.normal @ turn.T, atol=1e-6)
+    turned = msgspec.structs.replace(light, axis=light.axis @ turn.T)
+    shadows = ground_shadows(with_ground.ground, turned.unit_lobes, OPERATOR)
+    np.testing.assert_allclose(
+        shadows.shadowed @ light.weight / (shadows.open @ light.weight), shadows.ratio, atol=1e-5
+    )
+
+
+def test_a_solve_uses_the_shadows_that_its_objects_expect():
+    problem, true = photographed(5, 2, cells=60)
+    right, wrong = floor(true[0]), floor(true[1])
+    wrong = msgspec.structs.replace(wrong, radiance=2 - wrong.radiance)
+    hiding = {
+        "visibility": np.full((len(problem.blocks[0]), K), 255, np.uint8),
+        "directions": fibonacci_sphere(K)[None],
+    }
+    blocks = [
+        msgspec.structs.replace(block, ground=ground, **hiding)
+        for block, ground in zip(problem.blocks, (right, wrong), strict=True)
+    ]
+    solution = solve(problem.with_blocks(blocks), start_from_photos(3), QUICK)
+    assert [decision.accepted for decision in solution.grounds] == [True, False]
+    assert solution.grounds[0].correlation > 0.5 > 0 > solution.grounds[1].correlation
+    used = solution.effective_problem(problem.with_blocks(blocks)).blocks
+    assert used[0].ground is not None and used[1].ground is None
