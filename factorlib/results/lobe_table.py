@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factorlib.dataset.schema import LightSlice
-from factorlib.light.lobes import Lobes
+from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.results.materials import read_exposures
@@ -55,17 +55,17 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
     return {name: Lobes(part[:, :3].copy(), part[:, 3].copy(), part[:, 4:].copy()) for name, part in parts.items()}
 
 
-def read_photo_light(exported: Path, photo: str, light: LightSlice) -> Lobes:
-    """Read the light of a photo in the photo's own camera axes, with its exposure applied.
+def read_photo_light(folder: Path, photo: str, light: LightSlice) -> Lobes:
+    """Read the light of a photo in the photo's own camera axes, with its exposure applied; dark if it is unknown.
 
     Args:
-        exported: the folder of `export`'s result, whose gauge the light is in
+        folder: the folder of the result of `solve` or `export`, in whose gauge the light is
         photo: name of the photo
         light: the photo's illumination and rotation
     """
-    lobes = read_lobes(exported / "lobes.parquet")[light.illumination]
+    lobes = read_lobes(folder / "lobes.parquet").get(light.illumination, no_lobes())
     if len(lobes) == 0:
         log.warning("%s: nothing is known of its light: its pictures are black", photo)
     if light.world_from_camera is not None:
         lobes = lobes.rotate(np.array(light.world_from_camera).T)
-    return lobes.scale(np.array(read_exposures(exported / "exposures.json").get(photo, 1.0)))
+    return lobes.scale(np.array(read_exposures(folder / "exposures.json").get(photo, 1.0)))

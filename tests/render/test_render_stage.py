@@ -78,11 +78,10 @@ def test_resynthesis_is_lit_inside_the_mask_alone_and_observed_normals_are_those
 
 
 def test_unknown_light_is_black_and_said(inputs, tmp_path, caplog):
-    dark = {
-        stage: instead(inputs[stage] / "lobes.parquet", lambda file: write_lobes(file, {"front": no_lobes()}))
-        for stage in ("solve", "export")
-    }
-    with dark["solve"], dark["export"]:
+    """As of a photo without observations: `solve` writes no light, and `export` one without lobes."""
+    solved = instead(inputs["solve"] / "lobes.parquet", lambda file: write_lobes(file, {}))
+    exported = instead(inputs["export"] / "lobes.parquet", lambda file: write_lobes(file, {"front": no_lobes()}))
+    with solved, exported:
         out = run(inputs, "front", tmp_path / "out")
     assert "nothing is known of its light" in caplog.text
     assert not read_rgb_exr(out / "resynthesis" / "front.exr").any()
