@@ -25,7 +25,7 @@ from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.background import surrounding_radiance
 from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre
-from factorlib.urm.ground import ground_observations
+from factorlib.urm.ground import GroundView, ground_observations
 from factorlib.urm.observations import write_observations
 from factorlib.urm.reduction import merge, sample
 
@@ -77,7 +77,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if params.directions and len(observations):
         occluders = Occluders(list(meshes.values()), [poses.objects[each].pose for each in meshes])
         if ground is not None:
-            shadows = ground_observations(photo, geometry, camera, ground, occluders, observations, params.directions)
+            view = GroundView(camera, ground, occluders)
+            shadows = ground_observations(photo, geometry, view, observations, params.directions)
             if shadows is not None:
                 (out / "ground").mkdir()
                 write_observations(out / "ground" / f"{name}.parquet", shadows)

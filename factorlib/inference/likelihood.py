@@ -200,12 +200,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             photo_cells = part.by_photo.T @ J
             L[photos, cells] += photo_cells
             L[cells, photos] += photo_cells.T
-        if self.ground is not None:
-            value += self.ground.gradient(self.light.weight, FIT_LOSS, self.temperature)[0]
-            for c, (J, r) in enumerate(self.ground.linearise(self.light.weight, FIT_LOSS, self.temperature)):
-                cells = slice(c * p, (c + 1) * p)
-                L[cells, cells] += gram_matrix(J)
-                g_l[cells] += J.T @ r
+        value += self._add_ground(L, g_l)
         loss = illumination.fitted_loss(illumination.block.residuals(prediction.radiance), self.loss)
         factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
@@ -249,6 +244,17 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             hessian[-1, :p] = hessian[:p, -1] = fixed_rows[free]
             hessian[-1, -1] = fixed_rows[~free].sum()
         return hessian
+
+    def _add_ground(self, L: Float[np.ndarray, "l l"], g_l: Float[np.ndarray, " l"]) -> float:
+        """Add the ground to half the Hessian and half the gradient of the light; return its robust loss over T."""
+        if self.ground is None:
+            return 0.0
+        p = len(self.light)
+        for c, (J, r) in enumerate(self.ground.linearise(self.light.weight, FIT_LOSS, self.temperature)):
+            cells = slice(c * p, (c + 1) * p)
+            L[cells, cells] += gram_matrix(J)
+            g_l[cells] += J.T @ r
+        return self.ground.gradient(self.light.weight, FIT_LOSS, self.temperature)[0]
 
     def _photo_unknowns(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
         """Return the free log exposures and log tone exponents, and their standard deviations."""

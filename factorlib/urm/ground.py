@@ -21,7 +21,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
@@ -40,9 +40,10 @@ PATCHES = 20  # patches across
 LEAST_PIXELS = 4  # of a patch
 CAST = 6  # pixels of a patch whose visibility is computed
 LEAST_PATCHES = 60  # of a photo
+NEIGHBOURS = 1.6  # farthest neighbour of a patch, in patches: those at its corners
 RIM = 3  # width of the border of an object, pixels: its colour is mixed with the ground's
 MOST_DEGREE = 2
-EVEN = 0.03
+EVEN = 0.03  # spread of an even ground, as of log radiance
 MOST_SPREAD = 0.08  # spread of a ground that is not used
 WEIGHT = 2.0  # pixels that a patch counts as: errors of neighbouring pixels are alike
 OUTLIER = 0.3
@@ -50,131 +51,126 @@ ITERATIONS = 30  # of the robust fit
 LEAST_RADIANCE = 1e-6
 
 
-class GroundPixels(NamedTuple):
-    """Pixels that show the ground.
+class GroundView(NamedTuple):
+    """Objects on their ground before a camera.
 
     Attributes:
-        pixel: Columns and rows.
-        point: Points of the ground, in the camera's frame.
-        patch: Number of each pixel's patch, from 0.
-        radiance: Radiance.
+        camera: Camera.
+        ground: Plane on which the objects stand, in the camera's frame.
+        objects: The objects.
     """
 
-    pixel: Int[np.ndarray, "n 2"]
-    point: Float[np.ndarray, "n 3"]
-    patch: Int[np.ndarray, " n"]
-    radiance: Float[np.ndarray, "n 3"]
+    camera: Camera
+    ground: Plane
+    objects: Occluders
 
-    def take(self, rows: np.ndarray) -> GroundPixels:
-        """Return the pixels `rows` alone."""
-        return GroundPixels(*(values[rows] for values in self))
+    def on_plane(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Return coordinates on the plane, about the middle of the objects' feet, in units of the objects' extent."""
+        vertices = self.objects.mesh.vertices
+        feet = self.ground.onto(vertices)
+        normal = self.ground.normal
+        first = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+        axes = np.stack([first, np.cross(normal, first)], axis=1) / np.linalg.norm(first)
+        extent = np.linalg.norm(np.ptp(vertices, axis=0))
+        return (points - (feet.min(0) + feet.max(0)) / 2) @ axes / extent
 
-    def patch_means(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of values at the pixels over each patch."""
-        sums = np.stack([np.bincount(self.patch, column) for column in values.T], axis=1)
-        return sums / np.bincount(self.patch)[:, None]
+    def visibility(self, points: Float[np.ndarray, "n 3"], directions: int) -> UInt8[np.ndarray, "n k"]:
+        """Return the visibility of directions, 0 or 255, from points of the ground past the objects."""
+        normal = np.tile(self.ground.normal, (len(points), 1))
+        lifted = points + LIFT * self.objects.radius * normal
+        places = SurfacePoints(lifted, normal, np.ones(len(points), bool))
+        return self.objects.visibility_from(places, normal, fibonacci_sphere(directions)).visibility
+
+
+class Patches(NamedTuple):
+    """Patches of the ground, m of them.
+
+    Attributes:
+        pixel: Mean column and row.
+        point: Mean point, in the camera's frame.
+        log_radiance: Logarithm of the median radiance.
+        visibility: Mean visibility of k directions, 0 to 255.
+    """
+
+    pixel: Float[np.ndarray, "m 2"]
+    point: Float[np.ndarray, "m 3"]
+    log_radiance: Float[np.ndarray, "m 3"]
+    visibility: UInt8[np.ndarray, "m k"]
 
 
 def ground_observations(
-    photo: Channels,
-    geometry: Channels,
-    camera: Camera,
-    ground: Plane,
-    occluders: Occluders,
-    observed: Observations,
-    directions: int,
+    photo: Channels, geometry: Channels, view: GroundView, observed: Observations, directions: int
 ) -> Observations | None:
     """Return observations of the ground of one photo, of radiance relative to that without shadows; None if unfit.
 
     Args:
         photo: Channels of the stage `masks`.
         geometry: Channels of the stage `align`.
-        camera: Camera of the photo.
-        ground: Plane on which the objects stand, in the camera's frame.
-        occluders: The objects.
+        view: Camera, ground and objects.
         observed: Observations of the objects.
         directions: Number of directions of visibility.
     """
-    pixels = _ground_pixels(photo, camera, ground, occluders)
-    if pixels is None:
+    patches = _ground_patches(photo, view, directions)
+    if patches is None:
         return None
-    visibility = _visibility(pixels, ground, occluders, directions)
-    cosine = np.maximum(fibonacci_sphere(directions) @ ground.normal, 0)
-    point = pixels.patch_means(pixels.point)
-    radiance = np.array([np.median(pixels.radiance[pixels.patch == k], axis=0) for k in range(len(point))])
-    log_radiance = np.log(np.maximum(radiance, LEAST_RADIANCE))
-    place = _on_plane(point, ground, occluders)
-    shade, spread = remove_trend(log_radiance, place, visibility @ cosine)
-    shadowed = visibility.min(1) < 255
-    plain = (shade.mean(1) < OUTLIER) & (shadowed | (shade.mean(1) > -OUTLIER))
+    place = view.on_plane(patches.point)
+    cosine = np.maximum(fibonacci_sphere(directions) @ view.ground.normal, 0)
+    shade, spread = remove_trend(patches.log_radiance, place, patches.visibility @ cosine)
+    mean = shade.mean(1)
+    plain = (mean < OUTLIER) & ((patches.visibility.min(1) < 255) | (mean > -OUTLIER))
     if spread > MOST_SPREAD or plain.sum() < LEAST_PATCHES:
         return None
-    near = cKDTree(place).query_ball_point(place, 1.6 * 2 * RADIUS / PATCHES)
-    edge = np.array([np.square(shade[k].mean(1) - shade[i].mean()).mean() for i, k in enumerate(near)])
+    near = cKDTree(place).query_ball_point(place, NEIGHBOURS * 2 * RADIUS / PATCHES)
+    edge = np.array([np.square(mean[k] - mean[i]).mean() for i, k in enumerate(near)])  # d²
     weight = WEIGHT / (1 + (spread**2 + edge) / EVEN**2)  # (1)
-    n = int(plain.sum())
-    zero = np.zeros(n, "i4")
-    pixel = np.rint(pixels.patch_means(pixels.pixel)[plain]).astype("i4")
+    point = patches.point[plain]
+    zero = np.zeros(len(point), "i4")
     return Observations(
-        normal=np.tile(ground.normal, (n, 1)),
-        view=-point[plain] / np.linalg.norm(point[plain], axis=1, keepdims=True),
+        normal=np.tile(view.ground.normal, (len(point), 1)),
+        view=-point / np.linalg.norm(point, axis=1, keepdims=True),
         radiance=np.exp(shade[plain]),
-        clipped=np.zeros((n, 3), bool),
-        material=np.zeros(n, "i2"),
+        clipped=np.zeros((len(point), 3), bool),
+        material=zero.astype("i2"),
         photo=zero,
         illumination=zero,
-        x=pixel[:, 0],
-        y=pixel[:, 1],
+        x=np.rint(patches.pixel[plain, 0]).astype("i4"),
+        y=np.rint(patches.pixel[plain, 1]).astype("i4"),
         weight=weight[plain],
         materials=(GROUND,),
         photos=observed.photos,
         illuminations=observed.illuminations,
-        visibility=visibility[plain],
-        place=_relative_to_objects(point[plain], photo, geometry),
+        visibility=patches.visibility[plain],
+        place=_relative_to_objects(point, photo, geometry),
     )
 
 
-def _ground_pixels(photo: Channels, camera: Camera, ground: Plane, occluders: Occluders) -> GroundPixels | None:
-    """Return the pixels about the objects that show the ground, in patches of `LEAST_PIXELS`; None if there are few."""
+def _ground_patches(photo: Channels, view: GroundView, directions: int) -> Patches | None:
+    """Return the patches about the objects where `LEAST_PIXELS` show the ground; None if there are few."""
     radiance = np.stack([photo[c] for c in "RGB"], axis=-1)
     clipped = np.stack([photo[f"clipped.{c}"] for c in "RGB"], axis=-1).any(-1)
     hidden = binary_dilation((photo["label"] > 0) | (photo["left_out"] > 0), iterations=RIM)
-    y, x = np.nonzero(~hidden & ~clipped & np.isfinite(radiance).all(-1))
-    point = ground.hit(camera.rays_through(np.column_stack([x, y]) + 0.5))
-    place = np.floor((_on_plane(point, ground, occluders) + RADIUS) / (2 * RADIUS) * PATCHES)
-    near = np.linalg.norm(_on_plane(point, ground, occluders), axis=1) < RADIUS  # False where a ray misses the ground
-    square = (place[near] @ [PATCHES, 1]).astype(int)
-    names, patch, count = np.unique(square, return_inverse=True, return_counts=True)
-    if (count >= LEAST_PIXELS).sum() < LEAST_PATCHES:
+    pixel = np.argwhere(~hidden & ~clipped & np.isfinite(radiance).all(-1))[:, ::-1]
+    point = view.ground.hit(view.camera.rays_through(pixel + 0.5))
+    place = view.on_plane(point) / RADIUS
+    near = np.flatnonzero(np.linalg.norm(place, axis=1) < 1)  # not where a ray misses the ground
+    # pixels by patch, in the order of pixels within one
+    square = (np.floor((place[near] + 1) / 2 * PATCHES) @ [PATCHES, 1]).astype(int)
+    order = near[np.argsort(square, kind="stable")]
+    _, count = np.unique(square, return_counts=True)
+    rows = [part for part in np.split(order, np.cumsum(count)[:-1]) if len(part) >= LEAST_PIXELS]
+    if len(rows) < LEAST_PATCHES:
         return None
-    number = np.cumsum(count >= LEAST_PIXELS) - 1
-    whole = (count >= LEAST_PIXELS)[patch]
-    rows = np.flatnonzero(near)[whole]
-    return GroundPixels(
-        np.column_stack([x, y])[rows], point[rows], number[patch[whole]], radiance[y[rows], x[rows]].astype(float)
+    x, y = pixel.T
+    median = np.array([np.median(radiance[y[part], x[part]], axis=0) for part in rows])
+    # visibility from CAST pixels of each patch, at even steps
+    chosen = np.array([part[np.arange(CAST) * (len(part) - 1) // (CAST - 1)] for part in rows])
+    visibility = view.visibility(point[chosen.reshape(-1)], directions).reshape(len(rows), CAST, -1)
+    return Patches(
+        np.array([pixel[part].mean(0) for part in rows]),
+        np.array([point[part].mean(0) for part in rows]),
+        np.log(np.maximum(median, LEAST_RADIANCE)).astype(float),
+        np.rint(visibility.mean(1)).astype(np.uint8),
     )
-
-
-def _on_plane(points: Float[np.ndarray, "n 3"], ground: Plane, occluders: Occluders) -> Float[np.ndarray, "n 2"]:
-    """Return coordinates on the plane, about the middle of the objects' feet, in units of the objects' extent."""
-    vertices = occluders.mesh.vertices
-    feet = ground.onto(vertices)
-    first = np.cross(ground.normal, [0.0, 0.0, 1.0] if abs(ground.normal[2]) < 0.9 else [1.0, 0.0, 0.0])
-    axes = np.stack([first / np.linalg.norm(first), np.cross(ground.normal, first / np.linalg.norm(first))], axis=1)
-    extent = np.linalg.norm(np.ptp(vertices, axis=0))
-    return (points - (feet.min(0) + feet.max(0)) / 2) @ axes / extent
-
-
-def _visibility(pixels: GroundPixels, ground: Plane, occluders: Occluders, directions: int) -> UInt8[np.ndarray, "m k"]:
-    """Return the mean visibility of each patch, 0 to 255, over `CAST` of its pixels at even steps in their order."""
-    order = np.argsort(pixels.patch, kind="stable")
-    count = np.bincount(pixels.patch)
-    steps = np.arange(CAST) * (count[:, None] - 1) // (CAST - 1)
-    chosen = pixels.point[order[(np.cumsum(count) - count)[:, None] + steps].reshape(-1)]
-    normal = np.tile(ground.normal, (len(chosen), 1))
-    points = SurfacePoints(chosen + LIFT * occluders.radius * normal, normal, np.ones(len(chosen), bool))
-    cast = occluders.visibility_from(points, normal, fibonacci_sphere(directions))
-    return np.rint(cast.visibility.reshape(len(count), CAST, -1).mean(1)).astype(np.uint8)
 
 
 def remove_trend(
@@ -185,9 +181,9 @@ def remove_trend(
     Args:
         log_radiance: r of each patch.
         place: x and y.
-        light: Measure of the light that objects leave; that of the sky, for instance.
+        light: Measure of the light that objects leave to each patch, such as that of an even sky.
     """
-    lit: Bool[np.ndarray, " n"] = light >= np.median(light)
+    lit = light >= np.median(light)
     x, y = place.T
     for degree in range(MOST_DEGREE + 1):
         terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)

@@ -12,7 +12,7 @@ from factorlib.geometry.ground import Plane
 from factorlib.geometry.occlusion import Occluders
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.urm import ground as patches
-from factorlib.urm.ground import ground_observations
+from factorlib.urm.ground import GroundView, ground_observations
 
 CAMERA = Camera(320, 240, 300.0, (160.0, 120.0))
 UP = np.array([0.0, -np.cos(0.6), -np.sin(0.6)])  # the camera looks down by 34°
@@ -64,7 +64,7 @@ def observe(scene, colour=lambda point: 0.4, **changed):
     geometry |= {"depth": np.full(size, 4.0), "label": label, "confidence": np.ones(size)}
     objects = Occluders([sphere(1.0)], [Pose(np.eye(3), BALL)])
     source = SimpleNamespace(photos=("a",), illuminations=("a",))
-    return ground_observations(photo | changed, geometry, CAMERA, GROUND, objects, source, DIRECTIONS)
+    return ground_observations(photo | changed, geometry, GroundView(CAMERA, GROUND, objects), source, DIRECTIONS)
 
 
 def test_patches_are_as_dark_as_their_shadow(scene):
