@@ -82,8 +82,8 @@ ABSOLUTE = (
 )
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
 # Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
-# roughness.  With them and NORMAL_ERROR about 68 % of true values lie within one standard error on the sets that settings
-# were chosen on.
+# roughness.  With them and NORMAL_ERROR about 68 % of true values lie within one standard error on the sets that
+# settings were chosen on.
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.06])
 LIGHT_ERROR = 0.7
 # Standard deviation of normals of (2), radians.  On made chairs, whose true normals are known, errors of thin legs are
