@@ -24,8 +24,8 @@ from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.background import surrounding_radiance
+from factorlib.urm.cast_shadows import GroundView, ground_observations
 from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre
-from factorlib.urm.ground import GroundView, ground_observations
 from factorlib.urm.observations import write_observations
 from factorlib.urm.reduction import merge, sample
 

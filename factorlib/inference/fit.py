@@ -29,9 +29,9 @@ from jaxtyping import Bool, Float
 
 from factorlib.inference.background import condition_on_background
 from factorlib.inference.blocks import FIT_LOSS, Block
+from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.exposures import balance_exposures
 from factorlib.inference.forward import Illumination
-from factorlib.inference.ground import ground_shadows
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
 from factorlib.inference.material_prior import MaterialPrior, material_unknowns, materials_from_unknowns
@@ -190,7 +190,7 @@ def light_likelihood(
     tabulated = msgspec.structs.replace(illumination, table=table)
     shadows = illumination.block.ground
     if shadows is not None and not illumination.light.fixed.any():
-        ground = ground_shadows(shadows, *arguments[1:])
+        ground = cast_shadows(shadows, *arguments[1:])
     else:
         ground = None
     return with_hyperparameters(

@@ -31,10 +31,10 @@ from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     TRIAL_CELLS,
-    choose_grounds,
     select_backgrounds,
     select_distances,
     select_effects,
+    select_grounds,
     select_tone_curves,
 )
 from factorlib.inference.options import SolveOptions
@@ -128,10 +128,10 @@ def choose_distances(request: SolveRequest, state: SolveState) -> SolveState:
     return state.with_fit(selection.fit, distances=selection.evidence)
 
 
-def choose_shadows_on_grounds(request: SolveRequest, state: SolveState) -> SolveState:
+def choose_grounds(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose the lights that are also observed by shadows on the ground."""
     problem = request.problem.with_effects(state.shadows.accepted, state.interreflection.accepted)
-    return msgspec.structs.replace(state, grounds=choose_grounds(problem, state.fit, request.options))
+    return msgspec.structs.replace(state, grounds=select_grounds(problem, state.fit, request.options))
 
 
 def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
@@ -173,7 +173,7 @@ STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
     "background": choose_backgrounds,
     "tone": choose_tone,
     "distances": choose_distances,
-    "ground": choose_shadows_on_grounds,
+    "ground": choose_grounds,
     "materials": fit_materials,
     "splitting": choose_splittings,
     "prior": apply_prior,

@@ -47,9 +47,9 @@ from scipy.linalg import LinAlgError, cho_solve
 from scipy.linalg.blas import ssyrk
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from factorlib.inference.blocks import FIT_LOSS, RobustLoss
+from factorlib.inference.blocks import RobustLoss
+from factorlib.inference.cast_shadows import CastShadows
 from factorlib.inference.forward import Gradient, Illumination, Linearised
-from factorlib.inference.ground import GroundShadows
 from factorlib.inference.lights import DARKEST, Light
 from factorlib.inference.materials import Materials
 from factorlib.light.prior import LightPrior
@@ -134,7 +134,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
     log_determinant: float
     temperature: float
     loss: RobustLoss
-    ground: GroundShadows | None = None
+    ground: CastShadows | None = None
 
     @property
     def light(self) -> Light:
@@ -159,7 +159,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         data = self.illumination.gradient(self.loss, self.temperature)
         value, slope = self._prior()
         if self.ground is not None:
-            shadows, by_cells = self.ground.gradient(self.light.weight, FIT_LOSS, self.temperature)
+            shadows, by_cells = self.ground.gradient(self.light.weight, self.loss, self.temperature)
             value += shadows
             slope[: by_cells.size] += by_cells.T.reshape(-1)
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
@@ -250,11 +250,11 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         if self.ground is None:
             return 0.0
         p = len(self.light)
-        for c, (J, r) in enumerate(self.ground.linearise(self.light.weight, FIT_LOSS, self.temperature)):
+        for c, (J, r) in enumerate(self.ground.linearise(self.light.weight, self.loss, self.temperature)):
             cells = slice(c * p, (c + 1) * p)
             L[cells, cells] += gram_matrix(J)
             g_l[cells] += J.T @ r
-        return self.ground.gradient(self.light.weight, FIT_LOSS, self.temperature)[0]
+        return self.ground.gradient(self.light.weight, self.loss, self.temperature)[0]
 
     def _photo_unknowns(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
         """Return the free log exposures and log tone exponents, and their standard deviations."""

@@ -49,7 +49,7 @@ class MaterialPosterior(NamedTuple):
 def material_posterior(
     fitted: Float[np.ndarray, "7"],
     covariance: Float[np.ndarray, "7 7"],
-    model: Float[np.ndarray, "7 7"],
+    model_covariance: Float[np.ndarray, "7 7"],
     free: Bool[np.ndarray, "7"],
     name: str | None = None,
 ) -> MaterialPosterior:
@@ -58,16 +58,16 @@ def material_posterior(
     Args:
         fitted: θ̂.
         covariance: S.
-        model: M.
+        model_covariance: M.
         free: Mask of the unknowns to be estimated.
         name: Class of the material, if the user named it.
     """
-    deviation = np.where(free, np.sqrt(np.diag(covariance + model)), 0.0)
+    deviation = np.where(free, np.sqrt(np.diag(covariance + model_covariance)), 0.0)
     if not free[3:].any():
         return MaterialPosterior(fitted, deviation, np.zeros(7))
     mixture = Mixture(classes_of(name), one_tint=False)
     limited, center = without_prior(fitted, covariance, free, mixture)
-    limited += model
+    limited += model_covariance
     precision = np.linalg.inv(limited[np.ix_(free, free)])
     bounds = [(low, max(high, fitted[k])) for k, (low, high) in enumerate(BOUNDS) if free[k]]
 
@@ -80,7 +80,7 @@ def material_posterior(
         return float(off @ precision @ off) + energy, 2 * (precision @ off + slope[free])
 
     # (1) has several minima.  S is valid near the fit only, so classes are other starts only where M exceeds S
-    far = (np.diag(model) > np.diag(covariance))[3:].any()
+    far = (np.diag(model_covariance) > np.diag(covariance))[3:].any()
     starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean if far)]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()

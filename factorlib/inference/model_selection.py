@@ -41,9 +41,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import softmax
 
+from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
 from factorlib.inference.fit_runner import SolveState
-from factorlib.inference.ground import ground_shadows
 from factorlib.inference.materials import Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -262,7 +262,7 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
     return Selection(fit, evidence)
 
 
-def choose_grounds(problem: JointProblem, fit: Fit, options: SolveOptions) -> list[Decision]:
+def select_grounds(problem: JointProblem, fit: Fit, options: SolveOptions) -> list[Decision]:
     """Choose the lights that are also observed by shadows on the ground.
 
     Args:
@@ -275,7 +275,7 @@ def choose_grounds(problem: JointProblem, fit: Fit, options: SolveOptions) -> li
         if block.ground is None or options.ground == "off" or light.fixed.any():
             decisions.append(Decision(False))
             continue
-        correlation = ground_shadows(block.ground, light.unit_lobes, problem.operator).correlation(light.weight)
+        correlation = cast_shadows(block.ground, light.unit_lobes, problem.operator).correlation(light.weight)
         decisions.append(Decision(round(correlation, 6) >= LEAST_CORRELATION, correlation=correlation))
     return decisions
 

@@ -83,11 +83,10 @@ ABSOLUTE = (
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
 # Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
 # roughness.  With them and NORMAL_ERROR about 68 % of true values lie within one standard error on the sets that
-# settings were chosen on.
+# settings were chosen on (`studies.measured.standard_errors`).
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.06])
 LIGHT_ERROR = 0.7
-# Standard deviation of normals of (2), radians.  On made chairs, whose true normals are known, errors of thin legs are
-# 2.0° over the root of their confidence (median; 2.0° is 1.7° an axis), of which a part is common to all.
+# Standard deviation of normals of (2), radians, chosen on made chairs whose true normals are known.
 NORMAL_ERROR = np.radians(1.5)
 LEAST_CONFIDENCE = 0.02  # of a normal: a smaller one counts as this
 COVERAGE_ROWS = 32  # rows of the maps of a light's relative standard errors
@@ -125,8 +124,8 @@ class MaterialCovariance(NamedTuple):
     """Covariance of reflectances and roughnesses, in the gauge.
 
     Attributes:
-        by_data: That by the observations; (1), or that of independent noise.
-        by_normals: That by errors of normals, (2).
+        by_data: Covariance by the observations: (1), or that of independent noise.
+        by_normals: Covariance by errors of normals, (2).
         deviation: Deviation of the whitened residuals.
     """
 

@@ -2,7 +2,7 @@
 
 The light on a point of the ground is that of the directions which the objects do not hide from it (Sato, Sato and
 Ikeuchi, "Illumination from shadows", 2003).  The ground is divided into square patches.  A patch has the median
-radiance of its pixels, and the mean visibility of some of them, so that shares are as soft as shadows are.
+radiance of its pixels, and the mean visibility of some of them: both are averages over the patch.
 
 Grounds have patterns, things stand on them, and near lamps make one side brighter.  Let r be the log radiance of a
 patch.  A polynomial of its place is fitted to the less shadowed half of the patches, robustly, and taken away: the rest
@@ -44,6 +44,7 @@ NEIGHBOURS = 1.6  # farthest neighbour of a patch, in patches: those at its corn
 RIM = 3  # width of the border of an object, pixels: its colour is mixed with the ground's
 MOST_DEGREE = 2
 EVEN = 0.03  # spread of an even ground, as of log radiance
+LEAST_SPREAD = 1e-3  # keeps weights finite on a ground without any pattern
 MOST_SPREAD = 0.08  # spread of a ground that is not used
 WEIGHT = 2.0  # pixels that a patch counts as: errors of neighbouring pixels are alike
 OUTLIER = 0.3
@@ -191,7 +192,7 @@ def remove_trend(
         for _ in range(ITERATIONS):
             polynomial = np.linalg.lstsq(terms * weight[:, None], log_radiance * weight[:, None], rcond=None)[0]
             shade = log_radiance - terms @ polynomial
-            spread = max(robust_deviation(shade.mean(1)[lit]), 1e-3)
+            spread = max(robust_deviation(shade.mean(1)[lit]), LEAST_SPREAD)
             weight = lit / np.sqrt(1 + (shade.mean(1) / spread) ** 2)
         if spread < EVEN:
             break

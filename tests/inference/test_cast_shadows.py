@@ -7,12 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference.blocks import FIT_LOSS, Block, Noise
+from factorlib.inference.cast_shadows import CastShadows, cast_shadows
 from factorlib.inference.fit import Hyperparameters, initial_fit, light_likelihood
 from factorlib.inference.forward import Illumination
-from factorlib.inference.ground import GroundShadows, ground_shadows
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import choose_grounds
+from factorlib.inference.model_selection import select_grounds
 from factorlib.inference.observed import blocks_of_observations, read_grounds
 from factorlib.inference.optimizer import descend_light, step_light
 from factorlib.inference.options import SolveOptions
@@ -46,7 +46,7 @@ def floor(light, patches=150, seed=0) -> Block:
 
 def ratio(block: Block, light) -> np.ndarray:
     """Light on patches over that without the ball."""
-    shadows = ground_shadows(block, light.unit_lobes, OPERATOR)
+    shadows = cast_shadows(block, light.unit_lobes, OPERATOR)
     return shadows.shadowed @ light.weight / (shadows.open @ light.weight)
 
 
@@ -57,7 +57,7 @@ def with_floor(problem, light):
 
 def test_slopes_are_those_of_the_forward_model():
     light, other = (on_even_cells(drawn(seed, CELLS)) for seed in (3, 4))
-    shadows = ground_shadows(floor(other), light.unit_lobes, OPERATOR)
+    shadows = cast_shadows(floor(other), light.unit_lobes, OPERATOR)
     w, step = light.weight, np.random.default_rng(0).normal(size=light.weight.shape)
     value, slope = shadows.gradient(w, FIT_LOSS, 2.0)
     after, before = (shadows.gradient(w * np.exp(h * step), FIT_LOSS, 2.0)[0] for h in (1e-4, -1e-4))
@@ -112,7 +112,7 @@ def test_shadows_count_only_where_the_objects_expect_them():
 
     def chosen(shown, **options) -> list:
         blocks = [msgspec.structs.replace(problem.blocks[0], ground=shown)]
-        return choose_grounds(problem.with_blocks(blocks), fit, SolveOptions(**options))
+        return select_grounds(problem.with_blocks(blocks), fit, SolveOptions(**options))
 
     accepted = chosen(floor(true[0]))[0]
     assert accepted.accepted and accepted.correlation > 0.99
@@ -125,7 +125,7 @@ def test_shadows_count_only_where_the_objects_expect_them():
 
 def test_a_ground_without_any_shadow_has_no_correlation():
     one = np.ones((5, 3))
-    assert GroundShadows(np.ones((5, 2)), np.ones((5, 2)), one, one).correlation(np.ones((2, 3))) == 0
+    assert CastShadows(np.ones((5, 2)), np.ones((5, 2)), one, one).correlation(np.ones((2, 3))) == 0
 
 
 def test_a_ground_is_read_and_turns_with_its_camera(tmp_path):
@@ -147,7 +147,7 @@ def test_a_ground_is_read_and_turns_with_its_camera(tmp_path):
     assert without.ground is None
     np.testing.assert_allclose(with_ground.ground.normal, shown.normal @ turn.T, atol=1e-6)
     turned = msgspec.structs.replace(light, axis=light.axis @ turn.T)
-    shadows = ground_shadows(with_ground.ground, turned.unit_lobes, OPERATOR)
+    shadows = cast_shadows(with_ground.ground, turned.unit_lobes, OPERATOR)
     np.testing.assert_allclose(
         shadows.shadowed @ light.weight / (shadows.open @ light.weight), shadows.ratio, atol=1e-5
     )

@@ -1,12 +1,12 @@
 """Shadows on the ground, as observations of a light.
 
-`factorlib.urm.ground` says how much darker patches of the ground are than if nothing shadowed them.  Of a diffuse
+`factorlib.urm.cast_shadows` says how much darker patches of the ground are than if nothing shadowed them.  Of a diffuse
 ground that is q_i = E_i/F_i, in each channel, whatever its reflectance and its exposure:
 
     E_i = Σ_p v_ip D_ip w_p,     F_i = Σ_p D_ip w_p,     ∂(E_i/F_i)/∂w_p = (v_ip − E_i/F_i) D_ip/F_i              (1)
 
 with D_ip the diffuse response of patch i to lobe p, v_ip the share of it that shadows leave, and w the weights of a
-light.  Light that objects send to the ground is neglected.
+light.  Light that objects send to the ground, and tone curves, are neglected.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from factorlib.reflection.operator import Operator
 LEAST_VARIANCE = 1e-8  # of ratios that are not constant
 
 
-class GroundShadows(msgspec.Struct, frozen=True):
+class CastShadows(msgspec.Struct, frozen=True):
     """Responses of n patches of the ground to the p lobes of a light.
 
     Attributes:
@@ -76,10 +76,10 @@ class GroundShadows(msgspec.Struct, frozen=True):
         return predicted, whole, (predicted - self.ratio) * self.precision
 
 
-def ground_shadows(ground: Block, lobes: UnitLobes, operator: Operator) -> GroundShadows:
+def cast_shadows(ground: Block, lobes: UnitLobes, operator: Operator) -> CastShadows:
     """Return the responses of the ground of a light's photos to its lobes."""
     rows = slice(None)
     shadowed, whole = (
         diffuse_response(each, rows, lobes, operator) for each in (ground, ground.with_effects(False, False))
     )
-    return GroundShadows(shadowed, whole, ground.radiance * ground.unit, ground.precision / ground.unit)
+    return CastShadows(shadowed, whole, ground.radiance * ground.unit, ground.precision / ground.unit)
