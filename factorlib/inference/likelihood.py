@@ -18,8 +18,8 @@ are zero.  Shadows on the ground (`factorlib.inference.cast_shadows`) are furthe
 Without the determinant, light and materials are ambiguous.  The ambiguity then always favours the light of least
 contrast and the materials of least roughness, as blind deconvolution favours no blur (Levin et al. 2009, "Understanding
 and evaluating blind deconvolution algorithms").  Radiance is linear in w ∝ exp(u) and in exposures e, so ∂J/∂θ, ∂J/∂u
-and ∂J/∂log e are exact but for robust weights, clipping and slopes of tone curves, which are taken as constant.  With Σ
-= H⁻¹
+and ∂J/∂log e are exact but for robust weights, clipping and slopes of tone curves, which are taken as constant.
+With Σ = H⁻¹
 
     ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,
     ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T,      ½ ∂ log det H/∂log e_f = Σ_{i in photo f} J_i Σ J_iᵀ / T.      (2)
