@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
 import time
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from factorlib.runner.dataset_state import DatasetState
 from factorlib.runner.display import Display
 from factorlib.runner.plan import PlannedStep, Step
 from factorlib.runner.results_folder import make_view
-from factorlib.runner.run_folder import begin_run
+from factorlib.runner.run_folder import begin_run, end_run
 from factorlib.runner.store import lock
 from factorlib.runner.worker import Outcome, StageCode, Task, Workers, run_step
 from factorlib.wholefile import append_text, write_text
@@ -48,7 +47,7 @@ def run(state: DatasetState, display: Display) -> Run:
     state.results.set_owner(state.project, state.data.folder)
     folder, alive = begin_run(state.store)
     with contextlib.ExitStack() as stack:
-        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        stack.callback(end_run, folder)
         workers = Workers(state.spec.pipeline.executor, folder, display.report)
         stack.callback(workers.close)
         stack.callback(alive.release)  # Processes of unfinished steps end then.

@@ -253,7 +253,7 @@ def is_locked(path: Path) -> bool:
     except OSError:
         return False
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # Shared: two that ask do not see each other.
     except OSError as error:
         return isinstance(error, BlockingIOError)
     finally:
@@ -343,7 +343,7 @@ def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, o
             shipped = msgspec.json.decode(file.read_bytes(), type=Shipped)
         made_by = shipping.made_by if shipping else []
         if shipped_record(shipped.record, made_by) == shipped_record(record, made_by):
-            out.mkdir(parents=True)
+            out.mkdir()
             for name in (name for name in shipped.files if (file.parent / name).is_file()):
                 shutil.copyfile(file.parent / name, out / name)
             if faults := faults_of(out, shipped.files):

@@ -171,7 +171,7 @@ def _compute(task: Task, store: Store, events: Events) -> None:
     module = load_stage(task.code)  # takes seconds
     params = convert_params(module, task.code)
     photo = task.record["photo"]
-    out.mkdir(parents=True)
+    out.mkdir()  # Not its parent: the folder of a run that has ended must not come back.
     _check_code(task, store)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     files = {field.removeprefix("file:"): path for field, path in task.files.items()}

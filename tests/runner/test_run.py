@@ -1,6 +1,8 @@
 """Real runs of a toy pipeline: what runs, what is kept, what is shown, what survives."""
 
+import fcntl
 import io
+import itertools
 import json
 import os
 import re
@@ -14,6 +16,8 @@ from factorlib.errors import InputError
 from factorlib.runner import display, verbs
 from factorlib.runner.plan import PlannedStep, Step
 from factorlib.runner.results_folder import clean, collect
+from factorlib.runner.run_folder import begin_run, end_run
+from factorlib.runner.store import Store, is_locked, lock
 from tests.faults.test_kills import start, wait_until
 from tests.runner import toy
 from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
@@ -340,3 +344,28 @@ def test_a_given_folder_is_read_and_counts_by_content_not_by_place(giving, tmp_p
     assert str(tmp_path) not in "".join(path.read_text() for path in (giving.build / "store" / "keys").iterdir())
     edit(giving, "stages/table.py", "    (out", "    (inputs['start'] / 'seed.txt').write_text('9')\n    (out")
     assert make(giving, one) == 1, "what changes while it is read is no result"
+
+
+def test_the_folder_of_a_run_goes_even_if_a_step_writes_to_it_while_it_is_deleted(tmp_path, monkeypatch):
+    folder, alive = begin_run(Store(tmp_path / "store"))
+    alive.release()
+    delete, late = shutil.rmtree, iter("12")
+
+    def delete_while_one_writes(path, ignore_errors):
+        delete(path)
+        for name in itertools.islice(late, 1):
+            (path / name).mkdir(parents=True)
+
+    monkeypatch.setattr(shutil, "rmtree", delete_while_one_writes)
+    end_run(folder)
+    assert not folder.exists() and not list(late)
+
+
+def test_two_that_ask_whether_a_run_lives_do_not_take_each_other_for_it(tmp_path):
+    path = tmp_path / "lock"
+    held = lock(path)
+    assert is_locked(path)
+    held.release()
+    with open(path, "rb") as asking:
+        fcntl.flock(asking, fcntl.LOCK_SH)
+        assert not is_locked(path)
