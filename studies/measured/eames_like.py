@@ -35,8 +35,8 @@ from studies.measured.standard_errors import CELLS, light_deviations, material_d
 from studies.measured.tools import ROOT, Tables, evaluate_dataset, value_at
 
 PLACE = ROOT / "build/bench/eames-like"
-SEEDS = (161, 162, 163, 164, 165)
-CAPTURED_SEEDS = (166, 167, 168, 169, 170)
+SEEDS = (171, 172, 173, 174, 175)
+CAPTURED_SEEDS = (176, 177, 178, 179, 180)
 MAPS = 6  # of a set: one for each photo
 PRIOR = Path("factorlib/light/prior.json")
 COPIED = ("factorlib", "stages", "recipes", "pipeline.yaml")
