@@ -186,9 +186,10 @@ def _visible_meshes(
 
 
 def _shape(materials: list[str], cameras: Cameras) -> dict[str, Any]:
-    """Return the entry of a mesh without a file: a hull, or open where no cameras are known."""
+    """Return the entry of a mesh without a file: a hull, a body of revolution, or open where nothing is known."""
     parts = {"parts": {name: name for name in materials}} if len(materials) > 1 else {"material": materials[0]}
-    return ({"hull": True} if cameras.source else {"file": UNKNOWN}) | parts
+    without = {"lathe": True} if cameras.revolved else {"file": UNKNOWN}
+    return ({"hull": True} if cameras.source else without) | parts
 
 
 def _photo_entries(

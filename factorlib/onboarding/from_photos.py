@@ -1,7 +1,8 @@
 """A dataset from photographs alone: `make photos DATASET=mything PHOTOS=<folder>`.
 
 Masks are alpha channels, files beside the photos, or mattes of a network.  Cameras are those in the folder, else those
-of structure from motion.  With cameras the shape is the visual hull of the masks.
+of structure from motion.  With cameras the shape is the visual hull of the masks, without them a body of revolution if
+every mask looks like one.
 """
 
 import json
@@ -30,10 +31,12 @@ from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
 from factorlib.onboarding.photo_folder import Cameras, folder_and_stem
 from factorlib.shapes.hull import agreement, agreements, focal_by_hull, hull_box
+from factorlib.shapes.lathe import is_revolved
 from factorlib.shapes.motion import PhotoForMotion, cameras_by_motion
 from factorlib.shapes.outline import Outline
 
 MOST_PIXELS = 1_000_000  # pixels of a photo for mattes and structure from motion
+OUTLINE_PIXELS = 40_000  # pixels of a photo whose outline is asked for its symmetry
 DISAGREES = 0.8  # a mask's agreement with the hull of the others, as a share of the median one, below which it is named
 LENS_ERROR = 0.005  # greatest error of a lens by two coefficients, in widths of the image
 MARGINS = (0.05, 0.15)  # margins about the hull's box, in its longer side, of the crops that masks are estimated from
@@ -44,6 +47,11 @@ SHAPE = (
     'replace `file: "?"` by `lathe: true` (a vase, a bowl, a lamp), `primitive: ball | box | cylinder`, or the path of '
     "a mesh; or give MESHES=<folder>"
 )
+REVOLVED = (
+    "every mask looks like a body of revolution, so `lathe: true` is written: if it is none, write "
+    "`primitive: ball | box | cylinder` or `file: <mesh>` instead"
+)
+NO_FOREGROUND = "draw masks: `make new`, then `make label`"
 ONE_LIGHT = (
     "one light at rest is assumed: where photos have different ones, delete `illumination: room`; where the thing "
     "turned before a camera at rest, delete `world_from_camera: true`"
@@ -101,9 +109,6 @@ def dataset_from_photos(
         folder = Path(temporary)
         views = read_views(images, masks, model, folder, lambda share, text: report(share / 2, text))
         visible = {name: view for name, view in views.items() if view.small.objects.any()}
-        if not visible:
-            cure = "draw masks: `make new`, then `make label`"
-            raise InputError("no photo has a foreground", file=photos, key="PHOTOS", cure=cure)
         if source:
             cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
         elif not meshes:
@@ -112,8 +117,10 @@ def dataset_from_photos(
             views, outlines, model, folder, lambda share, text: report(0.9 + share / 10, text)
         )
         doubts = doubtful_masks(views, outlines)
+        if unknown := not cameras.source and not meshes:
+            cameras = outlined_shape(visible, report)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
-    return missing + [SHAPE] * (not cameras.source and not meshes), cameras.notes + doubts
+    return missing + [SHAPE] * (unknown and not cameras.revolved), cameras.notes + doubts
 
 
 def read_views(
@@ -127,6 +134,8 @@ def read_views(
         model: ONNX file of a matting network; None: that of the extra `masks`
         folder: a temporary folder
         report: called with the completed share and the current activity
+
+    Raises InputError if a photo needs a network that is not installed, or if no photo has a foreground.
     """
     views: dict[str, View] = {}
     network = None
@@ -157,6 +166,8 @@ def read_views(
         views[name] = View(
             PhotoForMotion(grey, objects, np.zeros_like(objects), *prior), opened.size, uncertain, matted
         )
+    if not any(view.small.objects.any() for view in views.values()):
+        raise InputError("no photo has a foreground", file=path.parent, key="PHOTOS", cure=NO_FOREGROUND)
     return views
 
 
@@ -256,6 +267,26 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
         camera = msgspec.structs.replace(photos[name].camera, focal=each.focal)
         outlines.append(Outline(name, photos[name].objects.astype(int), camera, pose=each.pose))
     return Cameras({"sfm": True}), outlines
+
+
+def outlined_shape(views: Mapping[str, View], report: Report) -> Cameras:
+    """Ask whether the mask of each photo, averaged down to OUTLINE_PIXELS, looks like a body of revolution.
+
+    Args:
+        views: the photos with a foreground
+        report: called with the completed share and the current activity
+
+    Returns:
+        No source of cameras, with the answer.
+    """
+    for k, (name, view) in enumerate(views.items()):
+        report(0.9 + 0.1 * k / len(views), f"{name}: symmetry of the outline")
+        factor = least_factor(view.small.objects.size, OUTLINE_PIXELS)
+        mask = box_majority(view.small.objects, factor).astype(int)
+        camera = view.small.camera.window(0, 0, factor, mask.shape[1], mask.shape[0])
+        if not is_revolved(Outline(name, mask, camera)):
+            return Cameras()
+    return Cameras(notes=[REVOLVED], revolved=True)
 
 
 def refine_masks(

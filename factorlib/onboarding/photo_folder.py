@@ -31,6 +31,7 @@ class Cameras(msgspec.Struct):
         files: its files, to be copied to cameras/ as they lie in the folder
         by_photo: further keys of photos in dataset.yaml
         notes: assumptions, in words
+        revolved: True if no source is known, and every mask looks like a body of revolution
     """
 
     source: dict[str, Any] = {}
@@ -38,6 +39,7 @@ class Cameras(msgspec.Struct):
     files: list[Path] = []
     by_photo: dict[str, dict[str, Any]] = {}
     notes: list[str] = []
+    revolved: bool = False
 
 
 def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict[str, Path], Cameras | None]:

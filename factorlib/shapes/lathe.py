@@ -14,7 +14,7 @@ again from all outlines. The axis is the shape's y.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
 import numpy as np
@@ -48,6 +48,7 @@ UNTOLD_DEG = 12.0  # a wider range of equally good tilts gives a warning
 MASK_ERROR = 0.2  # error of a mask's contour, pixels
 ROUNDS = 2  # number of alternations of carving and fitting poses
 COLUMNS = 96  # number of the mesh's vertices about the axis
+REVOLVED = 0.97  # least IoU of an outline and the best body of revolution from it alone that it is taken for
 RIM = 0.02  # share of the largest radius: thinner ends are cut off
 SEARCH = SearchOptions(views=200, keep=(24, 8, 4, 2))
 log = logging.getLogger("factorlib.shapes")
@@ -137,20 +138,30 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
     return msgspec.structs.replace(mesh_profile(profile).with_size(1.0), overlap=mean_overlap)
 
 
+def is_revolved(outline: Outline) -> bool:
+    """Return True if a body of revolution of some tilt explains an outline."""
+    return any(body.overlap >= REVOLVED for body in _bodies(_fill_holes(outline), TILTS_DEG[::3]))
+
+
 def _fill_holes(outline: Outline) -> Outline:
     """Fill holes of the outline, such as a highlight that a mask lacks; no body of revolution has holes."""
     filled = np.where(binary_fill_holes(outline.part) & (outline.part == 0), 1, outline.part)
     return msgspec.structs.replace(outline, part=filled)
 
 
-def _plausible_bodies(outline: Outline) -> list[BodyView]:
-    """Return at most TRIED bodies that explain the outline as well as the best one, evenly over their tilts."""
-    # the largest body that fits, for each mirror plane of the outline and each tilt in it
-    bodies: list[BodyView] = []
+def _bodies(outline: Outline, tilts: Float[np.ndarray, " t"] = TILTS_DEG) -> Iterator[BodyView]:
+    """Yield the largest body that fits for each mirror plane of the outline and each tilt in it, upright ones first."""
     for normal in mirror_planes(outline):
         ray = outline.camera.rays_through(outline.middle[None])[0]
         ahead = ray - (ray @ normal) * normal
-        bodies += filter(None, (_body_at_tilt(outline, normal, ahead, float(tilt)) for tilt in TILTS_DEG))
+        for tilt in sorted(tilts, key=abs):
+            if body := _body_at_tilt(outline, normal, ahead, float(tilt)):
+                yield body
+
+
+def _plausible_bodies(outline: Outline) -> list[BodyView]:
+    """Return at most TRIED bodies that explain the outline as well as the best one, evenly over their tilts."""
+    bodies = list(_bodies(outline))
     bodies.sort(key=lambda body: -body.overlap)
     plausible = [body for body in bodies if body.overlap >= bodies[0].overlap - AS_GOOD]
     ordered = sorted(plausible, key=lambda body: body.tilt_deg)

@@ -13,7 +13,14 @@ from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.sources.source_image import SourceImage
 from factorlib.generate.solids import SHAPES
 from factorlib.geometry.raster import rasterise
-from factorlib.onboarding.from_photos import dataset_from_photos, distorted_camera, doubtful_masks, read_views
+from factorlib.onboarding.from_photos import (
+    REVOLVED,
+    SHAPE,
+    dataset_from_photos,
+    distorted_camera,
+    doubtful_masks,
+    read_views,
+)
 from factorlib.onboarding.matte import MatteModel, doubt, foreground, opaque_pixels
 from factorlib.onboarding.photo_folder import read_photo_folder
 from factorlib.scenes.stage_runs import CHECKOUT
@@ -54,6 +61,20 @@ def test_cut_outs_with_poses_become_a_valid_dataset_with_a_hull_and_a_focal_leng
     assert dataset.spec.meshes["thing"].hull and {photo.light for photo in dataset.spec.photos} == {"room"}
     assert dataset.external["3"].focal_px == pytest.approx(CAMERA.focal, rel=0.1)
     assert "mask of 5 in" in notes[-1] and "differs" in notes[-1] and steps == sorted(steps)
+
+
+@pytest.mark.parametrize("body, revolved", [("vase", True), ("blob", False)])
+def test_without_cameras_outlines_tell_whether_the_thing_is_a_body_of_revolution(tmp_path, body, revolved):
+    (tmp_path / "photos").mkdir()
+    for number in (0, 2):
+        alpha = rasterise(SHAPES[body](), CAMERA, POSES[number]).label > 0
+        picture = np.dstack([np.full((*alpha.shape, 3), 120), 255 * alpha]).astype(np.uint8)
+        Image.fromarray(picture).save(tmp_path / "photos" / f"{number}.png")
+    missing, notes = dataset_from_photos(tmp_path / "mine", tmp_path / "photos", None, None, lambda share, text: None)
+    assert (SHAPE in missing, REVOLVED in notes) == (not revolved, revolved)
+    if revolved:
+        dataset = read_dataset(tmp_path / "mine")
+        assert dataset.spec.meshes["thing"].lathe and Validation(dataset).faults("photo", None, {}, tmp_path) == []
 
 
 class Brightest:
