@@ -10,7 +10,7 @@ from factorlib.geometry.sphere import mirror_cells
 from factorlib.inference.background import Background
 
 PER_OBSERVATION = (
-    *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
+    *("normal", "view", "radiance", "clipped", "inverse_sigma", "material", "photo", "held_out"),
     *("visibility", "bounced", "confidence", "place", "row", "detail"),  # optional columns
 )
 CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
@@ -36,7 +36,7 @@ class Noise(msgspec.Struct, frozen=True):
         """Return the standard deviation σ of a pixel's radiance."""
         return np.sqrt(self.absolute**2 + (self.relative * radiance) ** 2)
 
-    def precision(
+    def inverse_sigma(
         self, radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n 3"]:
         """Return √weight/σ of observations, with their weights limited."""
@@ -82,7 +82,7 @@ class Block(msgspec.Struct, frozen=True):
         view: Unit vectors toward the camera, in the illumination's frame.
         radiance: Observed linear radiance, in `unit`.
         clipped: Mask of the channels whose radiance is a lower bound.
-        precision: 1/σ of the noise model times the root of the observation's weight; 0 for a channel without
+        inverse_sigma: 1/σ of the noise model times the root of the observation's weight; 0 for a channel without
             information.
         material: Number of each observation's material.
         photo: Number of each observation's photo in `photos`.
@@ -91,7 +91,7 @@ class Block(msgspec.Struct, frozen=True):
         directions: The k directions of `visibility`, in the block's frame, for each of the f photos.
         bounced: Radiance that hidden directions send, weighted by the cosine (RGB) and by a highlight (RGB): G_d and
             G_s of `factorlib.inference.interreflection`, in `unit`; None for no interreflection.
-        noise: Noise model; `precision` derives from its σ.
+        noise: Noise model; `inverse_sigma` derives from its σ.
         confidence: Confidence of the normals, 0 to 1; None if all are equally reliable.
         place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
         row: Index of the observation among all usable ones.
@@ -107,7 +107,7 @@ class Block(msgspec.Struct, frozen=True):
     view: Float[np.ndarray, "n 3"]
     radiance: Float[np.ndarray, "n 3"]
     clipped: Bool[np.ndarray, "n 3"]
-    precision: Float[np.ndarray, "n 3"]
+    inverse_sigma: Float[np.ndarray, "n 3"]
     material: Int[np.ndarray, " n"]
     photo: Int[np.ndarray, " n"]
     held_out: Bool[np.ndarray, " n"]
@@ -164,7 +164,9 @@ class Block(msgspec.Struct, frozen=True):
     def with_noise(self, noise: Noise) -> Block:
         """Return the same observations under another noise model."""
         return msgspec.structs.replace(
-            self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
+            self,
+            inverse_sigma=self.inverse_sigma * self.noise.sigma(self.radiance) / noise.sigma(self.radiance),
+            noise=noise,
         )
 
     def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, "n 3"]) -> Block:
@@ -180,7 +182,7 @@ class Block(msgspec.Struct, frozen=True):
 
         A clipped channel is a lower bound: it has a residual only where the prediction is too dark.
         """
-        difference = (radiance - self.radiance) * self.precision
+        difference = (radiance - self.radiance) * self.inverse_sigma
         return np.where(self.clipped, np.minimum(difference, 0.0), difference)
 
     def clusters(self) -> Int[np.ndarray, " n"]:

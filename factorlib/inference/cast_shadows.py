@@ -32,20 +32,20 @@ class CastShadows(msgspec.Struct, frozen=True):
         shadowed: v D of (1).
         open: D.
         ratio: q.
-        precision: 1/σ of q.
+        inverse_sigma: 1/σ of q.
     """
 
     shadowed: Float[np.ndarray, "n p"]
     open: Float[np.ndarray, "n p"]
     ratio: Float[np.ndarray, "n 3"]
-    precision: Float[np.ndarray, "n 3"]
+    inverse_sigma: Float[np.ndarray, "n 3"]
 
     def gradient(
         self, weight: Float[np.ndarray, "p 3"], loss: RobustLoss, temperature: float
     ) -> tuple[float, Float[np.ndarray, "p 3"]]:
         """Return the robust loss Σ ρ(r)/T, and half its gradient by the logarithms of the weights."""
         predicted, whole, residual = self._predict(weight)
-        by_ratio = loss.weights(residual) * residual * self.precision / whole / temperature
+        by_ratio = loss.weights(residual) * residual * self.inverse_sigma / whole / temperature
         by_weight = self.shadowed.T @ by_ratio - self.open.T @ (by_ratio * predicted)
         return float(loss.evaluate(residual).sum()) / temperature, by_weight * weight
 
@@ -55,17 +55,17 @@ class CastShadows(msgspec.Struct, frozen=True):
         """Yield ∂r/∂log w and r of each channel, weighted by the robust loss and divided by √T, float32."""
         predicted, whole, residual = self._predict(weight)
         pull = np.sqrt(loss.weights(residual) / temperature)
-        scale = pull * self.precision / whole
+        scale = pull * self.inverse_sigma / whole
         for c in range(3):
             slope = self.shadowed - predicted[:, c, None] * self.open
             jacobian = (scale[:, c, None] * slope * weight[:, c]).astype(np.float32)
             yield jacobian, (pull * residual)[:, c].astype(np.float32)
 
     def correlation(self, weight: Float[np.ndarray, "p 3"]) -> float:
-        """Return the correlation of E/F and q, means over channels, weighted by precision; 0 where one is constant."""
+        """Return the correlation of E/F and q, means over channels, weighted by 1/σ²; 0 where one is constant."""
         predicted, _, _ = self._predict(weight)
         both = np.stack([predicted.mean(1), self.ratio.mean(1)])
-        covariance = np.cov(both, aweights=np.square(self.precision).mean(1))
+        covariance = np.cov(both, aweights=np.square(self.inverse_sigma).mean(1))
         scale = float(np.sqrt(covariance[0, 0] * covariance[1, 1]))
         return float(covariance[0, 1]) / scale if scale > LEAST_VARIANCE else 0.0
 
@@ -73,7 +73,7 @@ class CastShadows(msgspec.Struct, frozen=True):
         """Return E/F, F and the residuals r."""
         whole = self.open @ weight
         predicted = self.shadowed @ weight / whole
-        return predicted, whole, (predicted - self.ratio) * self.precision
+        return predicted, whole, (predicted - self.ratio) * self.inverse_sigma
 
 
 def cast_shadows(ground: Block, lobes: UnitLobes, operator: Operator) -> CastShadows:
@@ -82,4 +82,4 @@ def cast_shadows(ground: Block, lobes: UnitLobes, operator: Operator) -> CastSha
     shadowed, whole = (
         diffuse_response(each, rows, lobes, operator) for each in (ground, ground.with_effects(False, False))
     )
-    return CastShadows(shadowed, whole, ground.radiance * ground.unit, ground.precision / ground.unit)
+    return CastShadows(shadowed, whole, ground.radiance * ground.unit, ground.inverse_sigma / ground.unit)

@@ -209,7 +209,7 @@ def with_hyperparameters(likelihood: LightLikelihood, hyperparameters: Hyperpara
         cells = Q
         Q = np.diag(np.where(is_sun, SUN_DEVIATION**-2.0, 0.0))
         Q[np.ix_(~is_sun, ~is_sun)] = cells
-    if light.fixed.any():  # Q of the free cells given the held ones is their block of Q
+    if light.fixed.any():  # Q of the free cells given the fixed ones is their block of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
     mean = np.zeros(len(Q))
@@ -238,7 +238,7 @@ def estimate_hyperparameters(
     """
     light = likelihood.light
     cells, free = (np.flatnonzero(np.tile(mask, 3)) for mask in (~light.suns, light.free))
-    # covariance of u: H⁻¹ of the free cells, 0 of the held ones, without suns
+    # covariance of u: H⁻¹ of the free cells, 0 of the fixed ones, without suns
     covariance = np.zeros((3 * len(light), 3 * len(light)))
     covariance[np.ix_(free, free)] = cholesky_inverse(system.factor[: len(free), : len(free)])
     covariance = covariance[np.ix_(cells, cells)]
@@ -285,7 +285,7 @@ def reliable_mask(block: Block) -> Bool[np.ndarray, " n"]:
     result = np.ones(len(block), bool)
     if block.confidence is None:
         return result
-    weight = np.square(block.precision * block.noise.sigma(block.radiance)).max(1)
+    weight = np.square(block.inverse_sigma * block.noise.sigma(block.radiance)).max(1)
     for m in np.unique(block.material):
         rows = block.material == m
         typical = np.quantile(block.confidence[rows], 0.5, weights=weight[rows], method="inverted_cdf")

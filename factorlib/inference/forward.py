@@ -68,7 +68,7 @@ class Linearised(NamedTuple):
         by_roughness: ∂²r/∂u ∂roughness.
         by_material: ∂r with respect to log k_d, log k_s and roughness.
         by_photo: ∂r with respect to the free log exposures, the log tone exponents and, where it is free, the log of
-            the factor on held cells.  The first photo's exposure is fixed.
+            the factor on fixed cells.  The first photo's exposure is fixed.
         residual: r.
     """
 
@@ -193,7 +193,7 @@ class Illumination(msgspec.Struct, frozen=True):
             )
         # A = (k_d D + k_s S) e τ'/σ, linearised at the observed radiance
         slope = self.light.tone_slope(block.radiance[rows], block.photo[rows])
-        scale = block.precision[rows] * slope * self.exposure[rows]
+        scale = block.inverse_sigma[rows] * slope * self.exposure[rows]
         kd = self.materials.diffuse[block.material[rows]] * self.detail[rows]
         ks = self.materials.specular[block.material[rows]]
         return np.stack(
@@ -221,7 +221,7 @@ class Illumination(msgspec.Struct, frozen=True):
         residual = block.residuals(prediction.radiance)
         value = self.fitted_loss(residual, loss) / temperature
         # a = ½ ∂(Σ ρ/T)/∂ℓ; `lit` is the part of ℓ that is proportional to the light
-        by_radiance = self.root_weights(residual, loss, temperature) ** 2 * residual * block.precision
+        by_radiance = self.root_weights(residual, loss, temperature) ** 2 * residual * block.inverse_sigma
         by_linear = by_radiance * light.tone_slope(prediction.radiance, block.photo)
         from_light = prediction.linear - self.bounced
         # Σ a ∂ℓ/∂(log k_d, log k_s, roughness), and Dᵀ a e k_d + Sᵀ a e k_s with respect to w
@@ -237,7 +237,7 @@ class Illumination(msgspec.Struct, frozen=True):
             by_materials[m, 6] = float((ks * a * prediction.by_roughness[rows]).sum())
             lit = a * self.exposure[rows]
             by_weight += lookup.by_weight(lit * kd * detail[rows], lit * ks)
-        # gradient by log radiance of free cells, log exposures, log tone exponents and the log factor on held cells
+        # gradient by log radiance of free cells, log exposures, log tone exponents and the log factor on fixed cells
         by_cells = by_weight * light.weight
         by_photo = np.bincount(block.photo, (by_linear * from_light).sum(1), len(light.log_exposure))
         parts = [by_cells[light.free].T.reshape(-1), by_photo[len(by_photo) - light.free_exposures :]]
@@ -271,7 +271,7 @@ class Illumination(msgspec.Struct, frozen=True):
         light = self.light
         residual = self.block.residuals(prediction.radiance)
         pull = self.root_weights(residual, loss, temperature)
-        scale = pull * self.block.precision
+        scale = pull * self.block.inverse_sigma
         rising = scale * light.tone_slope(prediction.radiance, self.block.photo)  # ∂r/∂ℓ
         by_photos = self._by_photos(prediction, scale, rising)
         free = light.free if light.fixed.any() else slice(None)

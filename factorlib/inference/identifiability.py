@@ -194,7 +194,7 @@ def poorly_explained(problem: JointProblem, radiance: Sequence[Float[np.ndarray,
     """Yield a sentence for each illumination with many residuals far beyond the noise model."""
     for block, predicted in zip(problem.blocks, radiance, strict=True):
         residual = block.residuals(predicted)
-        share = float((np.abs(residual * (block.precision > 0)) > OUTLIER).mean())
+        share = float((np.abs(residual * (block.inverse_sigma > 0)) > OUTLIER).mean())
         if share > OUTLIERS:
             yield (
                 f"illumination '{block.name}': {share:.0%} of the values differ from the answer by more than "

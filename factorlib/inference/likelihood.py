@@ -165,11 +165,11 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             slope[: by_cells.size] += by_cells.T.reshape(-1)
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
-    def normal_equations(self, materials_given: bool = False, groupings: Sequence[Grouping] = ()) -> System:
+    def normal_equations(self, posterior: bool = False, groupings: Sequence[Grouping] = ()) -> System:
         """Return the value of (1) and its normal equations.
 
         Args:
-            materials_given: True to return φ instead of (1), without the costly derivatives of the determinants.
+            posterior: True to return φ instead of (1), without the costly derivatives of the determinants.
             groupings: Groups of observations, for `System.scores`.
         """
         illumination = self.illumination
@@ -206,14 +206,14 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / self.temperature
-        if not materials_given:
+        if not posterior:
             value += self._determinants(factor)
             determinant = _determinant_derivatives(parts, factor, places, illumination)
         scores = tuple(_scores(parts, grouping, places, size) for grouping in groupings)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
     def marginal(self, system: System) -> float:
-        """Return the value of (1) at a minimum of φ, from a system made with the materials given."""
+        """Return the value of (1) at a minimum of φ, from a system of φ."""
         return system.value + self._determinants(system.factor)
 
     def _determinants(self, factor: Float[np.ndarray, "l l"]) -> float:
@@ -228,7 +228,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         slope = self.precision @ u
         free = np.tile(self.light.free, 3)
         gradient = [slope[free], photo_values / width**2]
-        if self.light.scale_free:  # the derivative of all held cells together
+        if self.light.scale_free:  # the derivative of all fixed cells together
             gradient.append(slope[~free].sum(keepdims=True))
         return float(u @ slope + np.sum((photo_values / width) ** 2)), np.concatenate(gradient)
 

@@ -195,7 +195,7 @@ def _block(
     bounced = bounced_light(observations, scaled)
     block = Block(
         name, tuple(photos), unit, normal, view, scaled,
-        observations.clipped.astype(bool), noise.precision(scaled, observations.weight),
+        observations.clipped.astype(bool), noise.inverse_sigma(scaled, observations.weight),
         observations.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
         None if observations.confidence is None else observations.confidence.astype(float),

@@ -246,7 +246,7 @@ def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLi
 
     There are at most `iterations` minimisations by L-BFGS, each preconditioned by one factorisation of H.
     """
-    system = likelihood.normal_equations(materials_given=True)
+    system = likelihood.normal_equations(posterior=True)
     for _ in range(iterations):
 
         def objective(step: np.ndarray, start: LightLikelihood = likelihood) -> tuple[float, np.ndarray]:
@@ -261,7 +261,7 @@ def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLi
         step = minimise_lbfgs(objective, len(system.light_gradient), metric)
         likelihood = likelihood.with_point(step_light(likelihood.light, step))
         previous = system.value
-        system = likelihood.normal_equations(materials_given=True)
+        system = likelihood.normal_equations(posterior=True)
         if previous - system.value < TOLERANCE * abs(previous):
             break
     return likelihood, system

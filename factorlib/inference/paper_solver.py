@@ -232,14 +232,14 @@ class PaperObjective:
             prior = prior + ((sums / sums.mean() - 1) ** 2).mean()  # Var_c(W_c) / W̄²
             for m in np.unique(block.material[rows]).tolist():
                 selected = rows[block.material[rows] == m]
-                normal, view, photo, radiance, precision, clipped = (
+                normal, view, photo, radiance, inverse_sigma, clipped = (
                     torch.from_numpy(column[selected])
                     for column in (
                         block.normal,
                         block.view,
                         block.photo,
                         block.radiance,
-                        block.precision,
+                        block.inverse_sigma,
                         block.clipped,
                     )
                 )
@@ -249,7 +249,7 @@ class PaperObjective:
                 by_diffuse, by_specular = (part @ weight for part in responses)
                 exposure = torch.exp(log_exposure)[photo][:, None]
                 predicted = exposure * (diffuse[m] * by_diffuse + specular[m] * by_specular)
-                difference = (predicted - radiance) * precision
+                difference = (predicted - radiance) * inverse_sigma
                 squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
                 values += difference.numel()
         value = squares / max(values, 1) + self.options.prior * prior / len(self.blocks)

@@ -72,7 +72,7 @@ def sphere_block(
         view=np.tile([0.0, 0.0, -1.0], (rows, 1)),
         radiance=np.zeros((rows, 3)),
         clipped=np.zeros((rows, 3), bool),
-        precision=np.ones((rows, 3)),
+        inverse_sigma=np.ones((rows, 3)),
         material=material,
         photo=np.tile(np.repeat(np.arange(photos), n), len(numbers)),
         held_out=np.random.default_rng(seed).random(rows) < 0.1,
@@ -80,7 +80,7 @@ def sphere_block(
     radiance = Illumination(empty, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
     return msgspec.structs.replace(
-        empty, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled)
+        empty, radiance=scaled, unit=float(radiance.mean()), inverse_sigma=1 / np.hypot(0.05, 0.05 * scaled)
     )
 
 

@@ -52,7 +52,7 @@ def spheres(lights, materials=MATERIALS, shown=(0, 1, 2), size=14, noise=0.3, se
     blocks, rng = [], np.random.default_rng(seed)
     for k, light in enumerate(lights):
         clean = sphere_block(f"room{k}", light, materials, list(shown), OPERATOR, size=size)
-        noisy = clean.radiance + noise * rng.normal(size=clean.radiance.shape) / clean.precision
+        noisy = clean.radiance + noise * rng.normal(size=clean.radiance.shape) / clean.inverse_sigma
         blocks.append(msgspec.structs.replace(clean, radiance=np.maximum(noisy, 0.0)))
     return JointProblem(blocks, OPERATOR)
 

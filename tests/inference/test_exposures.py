@@ -39,7 +39,7 @@ def lamps(log_exposure: float = 0.0) -> JointProblem:
         }
         radiance = np.concatenate([one.radiance * one.unit, other.radiance * other.unit * np.exp(log_exposure)])
         photo = np.repeat([0, 1], [len(one), len(other)])
-        precision = one.noise.precision(radiance, np.ones(len(radiance)))
+        inverse_sigma = one.noise.inverse_sigma(radiance, np.ones(len(radiance)))
         blocks.append(
             msgspec.structs.replace(
                 one,
@@ -47,7 +47,7 @@ def lamps(log_exposure: float = 0.0) -> JointProblem:
                 photos=("a", "b"),
                 unit=1.0,
                 radiance=radiance,
-                precision=precision,
+                inverse_sigma=inverse_sigma,
                 photo=photo,
                 **joined,
             )

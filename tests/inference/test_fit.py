@@ -146,7 +146,7 @@ def test_the_contrast_of_a_light_is_found(solved):
 
 def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
     one = photographed(9, 1, cells=40, size=10)[0].blocks[0]
-    one = msgspec.structs.replace(one, precision=one.noise.precision(one.radiance, np.ones(len(one))))
+    one = msgspec.structs.replace(one, inverse_sigma=one.noise.inverse_sigma(one.radiance, np.ones(len(one))))
     unsure = np.arange(len(one)) % 3 == 0
     rated = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
     (reliable,) = reliable_observations(JointProblem([rated], OPERATOR)).blocks
@@ -154,7 +154,7 @@ def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
         reliable.radiance, one.radiance[~unsure]
     )
     noise = Noise(DARK_NOISE * one.noise.absolute, one.noise.relative)
-    assert reliable.precision == pytest.approx(noise.precision(reliable.radiance, np.ones(len(reliable))))
+    assert reliable.inverse_sigma == pytest.approx(noise.inverse_sigma(reliable.radiance, np.ones(len(reliable))))
 
 
 # ── lights unlike most: a fit says what the photographs say, not what is usual ───────────────────────────────────────

@@ -47,7 +47,7 @@ def log_det(one) -> float:
 
 def posterior(one) -> float:
     """φ."""
-    return one.normal_equations(materials_given=True).loss / one.temperature + prior_of(one.light, one.precision)
+    return one.normal_equations(posterior=True).loss / one.temperature + prior_of(one.light, one.precision)
 
 
 def moved(light, step):
@@ -137,7 +137,7 @@ def test_darker_materials_in_a_brighter_light_are_as_likely_but_for_the_prior(he
 def settled(one, steps=15):
     """The likelihood at the light that lowers φ."""
     for _ in range(steps):
-        part, light = one.normal_equations(materials_given=True), one.light
+        part, light = one.normal_equations(posterior=True), one.light
         one = one.with_point(moved(light, -np.linalg.solve(part.light_hessian, part.light_gradient).clip(-1, 1)))
     return one
 

@@ -155,7 +155,7 @@ def rooms(photos=1, size=12):
 def through(data, *exponents):
     """What cameras with tone curves make of it, one exponent a photo."""
     radiance = curve(data.radiance, np.array(exponents)[data.photo][:, None])
-    return msgspec.structs.replace(data, radiance=radiance, precision=1 / np.hypot(0.05, 0.05 * radiance))
+    return msgspec.structs.replace(data, radiance=radiance, inverse_sigma=1 / np.hypot(0.05, 0.05 * radiance))
 
 
 def exponents_of(solution):
@@ -252,9 +252,9 @@ def photographed_at(*curvatures):
         clean = (
             Illumination(data, msgspec.structs.replace(light, curvature=c), MATERIALS, OPERATOR).radiance() / data.unit
         )
-        precision = 1 / np.hypot(0.02, 0.02 * clean)
-        noisy = clean + 0.3 * rng.normal(size=clean.shape) / precision
-        blocks.append(msgspec.structs.replace(data, radiance=np.maximum(noisy, 0), precision=precision))
+        inverse_sigma = 1 / np.hypot(0.02, 0.02 * clean)
+        noisy = clean + 0.3 * rng.normal(size=clean.shape) / inverse_sigma
+        blocks.append(msgspec.structs.replace(data, radiance=np.maximum(noisy, 0), inverse_sigma=inverse_sigma))
     return blocks
 
 

@@ -221,7 +221,7 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     painted = Detail(np.zeros((body.nodes, 3)), log_factor)
     at = [attached_to(block.normal, body) for block in problem.blocks]
     clean = problem.with_blocks(
-        [msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks]
+        [msgspec.structs.replace(b, inverse_sigma=np.ones_like(b.inverse_sigma)) for b in problem.blocks]
     )
     point = Point(MATERIALS, in_units_of(problem.blocks, true))
     shown = clean.with_blocks([painted.apply_to(b, a) for b, a in zip(clean.blocks, at, strict=True)]).radiance(point)
