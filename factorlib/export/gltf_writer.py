@@ -141,11 +141,20 @@ def variant_name(overrides: Mapping[str, str]) -> str:
     return ", ".join(f"{part}: {material}" for part, material in sorted(overrides.items()))
 
 
-def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
-    """Read the materials of each part of a file from `write_glb`.
+class GltfPart(msgspec.Struct, frozen=True):
+    """Part of a file from `write_glb`.
 
-    Return them by part name: the part's own under "", and those of the variants under their names.
+    Attributes:
+        materials: name of its own material under "", and those of the variants under their names
+        base_colour: base colour of its own material, which a texture multiplies
     """
+
+    materials: dict[str, str]
+    base_colour: list[float]
+
+
+def read_parts_of_glb(path: str | Path) -> dict[str, GltfPart]:
+    """Read the parts of a file from `write_glb`, by name."""
     data = read_bytes(path, "a glTF file")
     tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])  # the JSON chunk
     names = [entry["name"] for entry in tree["materials"]]
@@ -153,9 +162,11 @@ def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
     parts = {}
     for mesh in tree["meshes"]:
         (primitive,) = mesh["primitives"]
-        parts[mesh["name"]] = {"": names[primitive["material"]]}
+        materials = {"": names[primitive["material"]]}
         for each in primitive.get("extensions", {}).get(VARIANTS, {}).get("mappings", []):
-            parts[mesh["name"]] |= {variants[v]: names[each["material"]] for v in each["variants"]}
+            materials |= {variants[v]: names[each["material"]] for v in each["variants"]}
+        core = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]
+        parts[mesh["name"]] = GltfPart(materials, core["baseColorFactor"][:3])
     return parts
 
 

@@ -7,7 +7,7 @@ vertices, which are therefore close together, for a number of directions.
 """
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import msgspec
@@ -17,17 +17,19 @@ from jaxtyping import Float, Int
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
-from factorlib.export.gltf_writer import read_part_materials, variant_name
+from factorlib.export.gltf_writer import GltfPart, read_parts_of_glb, variant_name
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.occlusion import LIFT, Occluders, SurfacePoints
 from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images.tone import srgb_decode, srgb_encode
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobe_table import read_lobes
+from factorlib.results.materials import SolvedMaterial
 from factorlib.results.poses import AS_IT_IS
 from factorlib.tracing.scene import sharpen_lobes
 
@@ -36,6 +38,7 @@ LONGEST = 0.08  # longest edge, in extents of the mesh
 LEAST_DIRECTIONS = 32  # least number of directions of a vertex's visibility
 MOST_DIRECTIONS = 256  # largest number of directions of a vertex's visibility
 MOST_VERTICES = 8_000  # vertices of a mesh with visibility in MOST_DIRECTIONS: less than 1 MB of page
+PAINT = "diffuse"  # attribute of vertices: diffuse reflectance of a painted part
 FACES = (32, 64, 128, 256)  # possible numbers of texels across a face of the cube map
 FINE_ENOUGH = 0.7  # largest texel, in widths 1/√λ of the sharpest lobe
 
@@ -108,21 +111,16 @@ class ViewedObject(msgspec.Struct, frozen=True):
 def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, list[dict[str, Any]]]:
     """Return all objects that can be viewed, and their meshes.
 
-    objects  photo, name; mesh, its index; materials, by part; rotation, y-up camera from object, row by row; eye, unit
-             vector from the object to that camera
+    objects  photo, name; mesh, its index; materials, by part; painted, by part; rotation, y-up camera from object, row
+             by row; eye, unit vector from the object to that camera
     meshes   name and `_mesh`; poses that scale a mesh by different factors have a mesh each
     """
     files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
-    materials = {name: read_part_materials(file) for name, file in files.items()}
+    parts = {name: dict(sorted(read_parts_of_glb(file).items())) for name, file in files.items()}
     loaded = {name: trimesh.load_scene(file, process=False).geometry for name, file in files.items()}
-    entries = []
-    for photo in (name for name in run.set.photos if name in run.poses):
-        for obj in objects[photo].objects:
-            entry = run.poses[photo].objects.get(obj.name)
-            if obj.mesh in files and entry is not None and not entry.left_out:
-                variant = variant_name(obj.materials)
-                entries.append(ViewedObject(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
-    entries += [ViewedObject(None, name, name) for name in files if all(name != each.mesh for each in entries)]
+    for name, geometry in loaded.items():
+        _set_paint(geometry, parts[name], run.exported)
+    entries = _viewed_objects(run, objects, files)
     kinds = sorted({(each.mesh, each.scale) for each in entries})
     triangles = sum(len(part.faces) for name, _ in kinds for part in loaded[name].values())
     share = min(1.0, MOST_TRIANGLES / max(1, triangles))
@@ -130,6 +128,8 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
     placed = []
     for each in entries:
         mesh = kinds.index((each.mesh, each.scale))
+        worn = {name: part.materials.get(each.variant, part.materials[""]) for name, part in parts[each.mesh].items()}
+        painted = {name for name, part in loaded[each.mesh].items() if PAINT in part.vertex_attributes}
         toward = -(YUP_FROM_CAMERA @ each.pose.apply(meshes[mesh][1][None])[0])
         length = np.linalg.norm(toward)
         placed.append(
@@ -137,7 +137,8 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
                 "photo": each.photo,
                 "name": each.name,
                 "mesh": mesh,
-                "materials": [part.get(each.variant, part[""]) for _, part in sorted(materials[each.mesh].items())],
+                "materials": list(worn.values()),
+                "painted": [k in painted and name == parts[each.mesh][k].materials[""] for k, name in worn.items()],
                 "rotation": (YUP_FROM_CAMERA @ each.pose.rotation).ravel().tolist(),
                 "eye": (toward / length).tolist() if length > 0 else [0.0, 0.0, 1.0],
             }
@@ -148,6 +149,41 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
     }
 
 
+def _viewed_objects(run: Artifacts, objects: Mapping[str, ObjectsSlice], meshes: Collection[str]) -> list[ViewedObject]:
+    """Return the objects of all photos in trusted poses, and the meshes of which there is none."""
+    entries = []
+    for photo in (name for name in run.set.photos if name in run.poses):
+        for obj in objects[photo].objects:
+            entry = run.poses[photo].objects.get(obj.name)
+            if obj.mesh in meshes and entry is not None and not entry.left_out:
+                variant = variant_name(obj.materials)
+                entries.append(ViewedObject(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
+    return entries + [ViewedObject(None, name, name) for name in meshes if all(name != each.mesh for each in entries)]
+
+
+def _set_paint(
+    meshes: Mapping[str, trimesh.Trimesh], parts: Mapping[str, GltfPart], table: Mapping[str, SolvedMaterial]
+) -> None:
+    """Set the diffuse reflectance at the vertices, the attribute PAINT, of the parts that have a texture.
+
+    Args:
+        meshes: the parts as a mesh library reads them, with texture coordinates from the lower left corner, by name
+        parts: their materials
+        table: the exported materials
+    """
+    for name, part in parts.items():
+        visual: Any = meshes[name].visual
+        if (texture := getattr(visual.material, "baseColorTexture", None)) is None:
+            continue
+        image = np.asarray(texture.convert("RGB"))
+        size = np.array(image.shape[1::-1])
+        column, row = ((visual.uv * [1, -1] + [0, 1]) * size).astype(int).clip(0, size - 1).T
+        core = 1 - max(table[part.materials[""]].reflectance.specular)  # the base colour is k_d / (1 − max k_s)
+        meshes[name].vertex_attributes[PAINT] = (
+            core * np.array(part.base_colour) * srgb_decode(image[row, column] / 255)
+        )
+
+
 def _mesh(
     parts: Mapping[str, trimesh.Trimesh], scale: Float[np.ndarray, "3"], share: float
 ) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
@@ -155,6 +191,7 @@ def _mesh(
 
     vertices         uint16, 3 per vertex, v / 32767.5 − 1 in radii of the mesh from its centre
     normals          int16, times 32767
+    diffuse          uint8, 3 per vertex, diffuse reflectance of painted parts, sRGB-encoded; None if no part is
     parts            by name, in order: triangles, uint32, 3 per triangle
     open             true if the mesh has a border; every triangle then occurs twice, once for either side
     sight            see `_sight`
@@ -164,7 +201,7 @@ def _mesh(
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
     pieces = [_simplify(part, share) for _, part in sorted(parts.items())]
-    vertices, normals, faces = zip(*pieces, strict=True)
+    vertices, normals, faces, colours = zip(*pieces, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
     labels = np.arange(1, len(pieces) + 1, dtype=np.int16)
     mesh = Mesh(
@@ -173,6 +210,7 @@ def _mesh(
         unit(np.vstack(normals) / scale),
         np.repeat(labels, [len(face) for face in faces]),
         any(bool(part.visual.material.doubleSided) for part in parts.values()),  # type: ignore[union-attr]
+        np.vstack(colours) if any(PAINT in part.vertex_attributes for part in parts.values()) else None,
     )
     # subdivide so that shadows fall between vertices, less finely if there would be too many
     longest = LONGEST * np.ptp(mesh.vertices, axis=0).max()
@@ -184,6 +222,7 @@ def _mesh(
     packed = {
         "vertices": _base64(np.rint((np.clip(sides.vertices, -1, 1) + 1) * 32767.5), "<u2"),
         "normals": _base64(np.rint(32767 * sides.normals), "<i2"),
+        "diffuse": None if sides.detail is None else _base64(np.rint(255 * srgb_encode(sides.detail.clip(0, 1))), "u1"),
         "parts": [_base64(sides.faces[sides.face_label == label], "<u4") for label in labels],
         "open": mesh.open,
         "sight": _sight(mesh, sides),
@@ -204,6 +243,7 @@ def _both_sides(mesh: Mesh) -> Mesh:
         np.vstack([faces, faces[:, ::-1] + len(mesh.vertices)]),
         np.vstack([mesh.normals, -mesh.normals]),
         np.tile(mesh.face_label, 2),
+        detail=None if mesh.detail is None else np.tile(mesh.detail, (2, 1)),
     )
 
 
@@ -249,14 +289,17 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
 
 def _simplify(
     part: trimesh.Trimesh, share: float
-) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Return vertices, normals and triangles of a part, simplified to `share` of its triangles by quadric error."""
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]]:
+    """Return vertices, normals, triangles and paint of a part, with `share` of its triangles by quadric error."""
+    diffuse = np.asarray(part.vertex_attributes.get(PAINT, np.zeros((len(part.vertices), 3))))
     if share == 1.0:
-        return part.vertices, part.vertex_normals, part.faces
+        return part.vertices, part.vertex_normals, part.faces, diffuse
     mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(part.vertices), o3d.utility.Vector3iVector(part.faces))
+    mesh.vertex_colors = o3d.utility.Vector3dVector(diffuse)
     mesh = mesh.merge_close_vertices(1e-7 * float(np.ptp(part.vertices, axis=0).max()))
     mesh = mesh.simplify_quadric_decimation(max(16, int(share * len(part.faces)))).compute_vertex_normals()
-    return np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), np.asarray(mesh.triangles)
+    arrays = (mesh.vertices, mesh.vertex_normals, mesh.triangles, mesh.vertex_colors)
+    return tuple(np.asarray(each) for each in arrays)  # type: ignore[return-value]
 
 
 def _base64(values: np.ndarray, kind: str) -> str:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.export import other_renderers
-from factorlib.export.gltf_writer import read_part_materials, write_glb
+from factorlib.export.gltf_writer import read_parts_of_glb, write_glb
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge
 from factorlib.export.other_renderers import Angles, distribution
@@ -233,7 +233,7 @@ def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
     dark = np.full(5, 3, np.int16)
     write_glb(tmp_path / "a.glb", mesh, names, CASES, {"legs: lambertian": other, "all dark": dark})
     tree, result = read_tree(tmp_path / "a.glb"), trimesh.load(tmp_path / "a.glb").geometry
-    parts = read_part_materials(tmp_path / "a.glb")
+    parts = read_parts_of_glb(tmp_path / "a.glb")
     variants = tree["extensions"]["KHR_materials_variants"]["variants"]
     assert [each["name"] for each in variants] == ["legs: lambertian", "all dark"]
     assert "KHR_materials_variants" in tree["extensionsUsed"] and len(tree["materials"]) == 3
@@ -241,15 +241,15 @@ def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
         variant = ["", "legs: lambertian", "all dark"][k]
         for face, label in enumerate(labels):
             (holds,) = [n for n, part in result.items() if np.isclose(part.vertices, vertices[3 * face]).all(1).any()]
-            assert parts[holds][variant] == names[label - 1]
+            assert parts[holds].materials[variant] == names[label - 1]
     for each in tree["meshes"]:
         mappings = each["primitives"][0]["extensions"]["KHR_materials_variants"]["mappings"]
         assert sorted(v for mapping in mappings for v in mapping["variants"]) == [0, 1]  # each once
     write_glb(tmp_path / "b.glb", mesh, names, CASES)
     plain = (tmp_path / "b.glb").read_bytes()
-    assert b"variants" not in plain and read_part_materials(tmp_path / "b.glb") == {
-        n: {"": n} for n in ("bright", "metal")
-    }
+    assert b"variants" not in plain
+    parts = read_parts_of_glb(tmp_path / "b.glb")
+    assert {name: part.materials for name, part in parts.items()} == {n: {"": n} for n in ("bright", "metal")}
 
 
 def test_variants_share_the_detail_of_reflectance_exactly(tmp_path):

@@ -22,6 +22,7 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.report import viewer
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.pictures import light_row
+from factorlib.results.materials import Reflectance
 from tests.align.scenes import mesh_of
 from tests.browser import BACK, CHROMIUM, HALF_FIELD, ball_seen, error, opened, rendered, shown
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
@@ -195,6 +196,33 @@ def test_what_is_hidden_sends_what_it_gets(report_page, tmp_path):
         assert seen("full", "ruby", 0.0) == pytest.approx([1, 0.5, 0.5], abs=0.03)
         assert seen("mirror", "full", 1.2) == pytest.approx([1, 1, 1], abs=0.05)
         assert seen("mirror", "none", 1.2) == pytest.approx([0, 0, 0], abs=0.2)
+        assert complaints == []
+
+
+@needs_chromium
+@pytest.mark.parametrize("simplified", [False, True])
+def test_paint_is_shown_while_its_part_has_its_own_material(report_page, tmp_path, monkeypatch, simplified):
+    """The left half of a ball has half of red's diffuse reflectance, the right half all of it."""
+    monkeypatch.setattr(viewer, "MOST_TRIANGLES", 4000 if simplified else 10**6)
+    export = shutil.copytree(report_page[1]["export"], tmp_path / "export")
+    ball = sphere(0.5)
+    detail = np.where(ball.vertices[:, :1] < 0, 0.5, 1.0) * np.ones(3)
+    painted = msgspec.structs.replace(ball, detail=detail, face_label=np.full(len(ball.faces), 2, np.int16))
+    red = msgspec.convert(json.loads((export / "materials.json").read_text())["materials"]["red"], Reflectance)
+    write_glb(export / "ball.glb", painted, ["brass", "red", "white"], TRUE | {"red": red})
+    folders = {**report_page[1].folders, "export": export}
+    page_of(msgspec.structs.replace(report_page[1], folders=folders), tmp_path / "report")
+    with opened(tmp_path / "report" / "index.html", viewport={"width": 1440, "height": 900}) as (page, complaints):
+        page.evaluate(FURNACE)
+        page.evaluate("Object.assign(viewer.data.materials.red, { specular: [0, 0, 0] })")
+
+        def seen(material: str) -> np.ndarray:
+            """The radiance in a sky of radiance 1, of the left and the right half."""
+            picture = shown(page, 0, "", "day", {"materials": [material]}, SIZE)
+            return picture[SIZE // 2, [SIZE // 3, 2 * SIZE // 3], :3]
+
+        assert seen("") == pytest.approx(np.outer([0.5, 1.0], red.diffuse), abs=0.02)
+        assert seen("red") == pytest.approx(np.outer([1.0, 1.0], red.diffuse), abs=0.02)
         assert complaints == []
 
 

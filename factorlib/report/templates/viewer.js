@@ -3,7 +3,8 @@
 // Frames: y-up, right-handed.  "ref" is the photo's camera turned y-up; the object stands in it, the light is turned in it,
 // and the eye moves about the object's middle.  Lengths are in radii of the object.
 //
-// Diffuse:  k_d / pi * (v E(n) + B) at vertices, the irradiance E read from a small cube map.
+// Diffuse:  k_d / pi * (v E(n) + B) at vertices, the irradiance E read from a small cube map.  k_d is the material's, or that of each vertex of a
+//           painted part, while it has its own material.
 // Specular: k_s * integral of L(i) D G1(i) G1(o) / (4 n.o) di, estimated at half vectors drawn from the visible normals
 //           (Heitz 2018; as spherical caps, Dupuy and Benyoub 2023), for which each sample counts L(i) G1(i).  A sample reads
 //           the light at the mip level whose texels are as large as the solid angle it stands for (Krivanek and Colbert 2008).
@@ -92,7 +93,9 @@ function unpacked(mesh) {
   sight.hidden = new Uint8Array(bytes(mesh.sight.hidden));
   const met = bytes(mesh.sight.met);
   sight.met = met.byteLength > 2 * sight.hidden.length ? new Uint32Array(met) : new Uint16Array(met);
-  return { vertices, normals: Float32Array.from(new Int16Array(bytes(mesh.normals)), (v) => v / 32767), parts, part, open: mesh.open, sight, name: mesh.name };
+  const decoded = (v) => v <= 0.04045 ? v / 12.92 : Math.pow((v + 0.055) / 1.055, 2.4);
+  const diffuse = mesh.diffuse === null ? null : Float32Array.from(new Uint8Array(bytes(mesh.diffuse)), (v) => decoded(v / 255));
+  return { vertices, diffuse, normals: Float32Array.from(new Int16Array(bytes(mesh.normals)), (v) => v / 32767), parts, part, open: mesh.open, sight, name: mesh.name };
 }
 
 function ball(rows = 48, columns = 96) {
@@ -108,7 +111,7 @@ function ball(rows = 48, columns = 96) {
       triangles.push(a, b, a + 1, a + 1, b, b + 1);
     }
   const position = new Float32Array(vertices);
-  return { name: "a ball", photo: null, materials: [null], rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], eye: [0, 0, 1],
+  return { name: "a ball", photo: null, materials: [null], painted: [false], rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], eye: [0, 0, 1],
            mesh: { vertices: position, normals: position, parts: [new Uint32Array(triangles)] } };
 }
 
@@ -127,8 +130,9 @@ function light_along(directions, lobes, unit, light_from_object) {
   return out;
 }
 
-// By vertex v and B of above, and what the vertex sends: 3 numbers each; one more vertex is black.  light: along the directions;  albedos: by part
-function reaching({ normals, part, sight }, light, albedos) {
+// By vertex v and B of above, and what the vertex sends: 3 numbers each; one more vertex is black.  light: along the directions;  materials: by part;
+// painted: by part
+function reaching({ normals, part, sight, diffuse }, light, materials, painted) {
   const n = normals.length / 3, { directions, counts, hidden, met } = sight, share = new Float32Array(3 * n).fill(1), bounced = new Float32Array(3 * n);
   const direct = new Float32Array(3 * n), sent = new Float32Array(3 * n + 3), weight = new Float32Array(hidden.length);
   for (let i = 0, pair = 0; i < n; i++) {
@@ -146,8 +150,12 @@ function reaching({ normals, part, sight }, light, albedos) {
       share[3 * i + c] = whole > 0 ? Math.max(0, 1 - lost / whole) : 1; direct[3 * i + c] = Math.max(0, whole - lost) / all;
     }
   }
+  const albedo = Float32Array.from({ length: 3 * n }, (_, k) => {
+    const at = part[Math.floor(k / 3)], material = materials[at];
+    return Math.min(1, (painted[at] ? diffuse[k] : material.diffuse[k % 3]) + material.specular[k % 3]);
+  });
   for (let bounce = 0; bounce <= BOUNCES; bounce++) {
-    for (let i = 0; i < n; i++) for (let c = 0; c < 3; c++) sent[3 * i + c] = albedos[part[i]][c] * (direct[3 * i + c] + bounced[3 * i + c]);
+    for (let i = 0; i < n; i++) for (let c = 0; c < 3; c++) sent[3 * i + c] = albedo[3 * i + c] * (direct[3 * i + c] + bounced[3 * i + c]);
     if (bounce === BOUNCES) break;
     bounced.fill(0);
     for (let i = 0, pair = 0; i < n; i++)
@@ -186,14 +194,14 @@ invariant gl_Position;
 void main() { vec3 at = ref_from_object * position; gl_Position = clip_from_ref * vec4(at, 1.0); }`;
 const SHADE_VERTEX = `#version 300 es
 precision highp samplerCube;
-in vec3 position, normal, share, bounced; in vec4 mirrored;
+in vec3 position, normal, share, bounced, diffuse; in vec4 mirrored;
 uniform samplerCube irradiance;
-uniform mat3 ref_from_object, light_from_ref; uniform mat4 clip_from_ref; uniform vec3 k_d, k_s;
+uniform mat3 ref_from_object, light_from_ref; uniform mat4 clip_from_ref; uniform vec3 k_d, k_s; uniform bool painted;
 out vec3 at, up; out vec4 lit;             // lit: all but the light mirrored from afar, and how much of that is free
 invariant gl_Position;
 void main() {
   at = ref_from_object * position; up = ref_from_object * normal; gl_Position = clip_from_ref * vec4(at, 1.0);
-  lit = vec4(k_d * (share * textureLod(irradiance, light_from_ref * up, 0.0).rgb + bounced) + k_s * mirrored.rgb, mirrored.a);
+  lit = vec4((painted ? diffuse : k_d) * (share * textureLod(irradiance, light_from_ref * up, 0.0).rgb + bounced) + k_s * mirrored.rgb, mirrored.a);
 }`;
 const DEPTH = `#version 300 es
 precision highp float; out vec4 colour;
@@ -261,7 +269,7 @@ function program(gl, vertex, fragment) {
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(made, shader);
   }
-  for (const [k, name] of ["position", "normal", "share", "bounced", "mirrored"].entries()) gl.bindAttribLocation(made, k, name);
+  for (const [k, name] of ["position", "normal", "share", "bounced", "mirrored", "diffuse"].entries()) gl.bindAttribLocation(made, k, name);
   gl.linkProgram(made);
   const places = {};
   return { use: () => gl.useProgram(made), at: (name) => places[name] ??= gl.getUniformLocation(made, name) };
@@ -314,33 +322,34 @@ class Renderer {
   buffer(mesh) {
     const gl = this.gl;
     if (this.buffers.has(mesh)) return this.buffers.get(mesh);
-    const arrays = [mesh.vertices, mesh.normals, ...(mesh.sight ? [0, 0, 0] : [])].map(() => gl.createBuffer());
+    const arrays = [mesh.vertices, mesh.normals, ...(mesh.sight ? [0, 0, 0] : []), ...(mesh.diffuse ? [0] : [])].map(() => gl.createBuffer());
     const parts = mesh.parts.map((triangles) => {
       const array = gl.createVertexArray();
       gl.bindVertexArray(array);
       for (const [k, buffer] of arrays.entries()) {
-        gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, k < 4 ? 3 : 4, gl.FLOAT, false, 0, 0);
+        gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, k === 4 ? 4 : 3, gl.FLOAT, false, 0, 0);
       }
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
       return { array, count: triangles.length };
     });
     const fill = (k, values) => { gl.bindBuffer(gl.ARRAY_BUFFER, arrays[k]); gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW); };
     fill(0, mesh.vertices); fill(1, mesh.normals);
+    if (mesh.diffuse) fill(5, mesh.diffuse);
     this.buffers.set(mesh, { parts, fill });
     return this.buffers.get(mesh);
   }
 
   // Fill what the light does at the vertices, and what is mirrored there, where either has changed; an object without `sight` hides nothing.
-  shadow(state, materials, eye, light, light_from_ref) {
+  shadow(state, materials, painted, eye, light, light_from_ref) {
     const { mesh, rotation } = state.object, { fill } = this.buffer(mesh);
     if (!mesh.sight) {
       for (const [k, value] of [[2, 1], [3, 0]]) this.gl.vertexAttrib3f(k, value, value, value);
       return this.gl.vertexAttrib4f(4, 0, 0, 0, 1);
     }
-    const light_from_object = times(light_from_ref, rotation), lit = [state.photo.light, light_from_object, materials].join();
+    const light_from_object = times(light_from_ref, rotation), lit = [state.photo.light, light_from_object, materials, painted].join();
     if (mesh.lit !== lit) {
-      const albedos = materials.map((name) => this.data.materials[name]).map((m) => m.diffuse.map((k_d, c) => Math.min(1, k_d + m.specular[c])));
-      const found = reaching(mesh, light_along(mesh.sight.directions, this.data.lights[state.photo.light].lobes, light.unit, light_from_object), albedos);
+      const along = light_along(mesh.sight.directions, this.data.lights[state.photo.light].lobes, light.unit, light_from_object);
+      const found = reaching(mesh, along, materials.map((name) => this.data.materials[name]), painted);
       fill(2, found.share); fill(3, found.bounced);
       Object.assign(mesh, { lit, sent: found.sent, eye: null });
     }
@@ -374,7 +383,8 @@ class Renderer {
     const gl = this.gl, target = this.targets(size), light = this.light(state.photo.light), view = this.camera(state, count > QUICK ? pass : null, size);
     const light_from_ref = times(state.photo.rotation, about_y(-state.turn)), gain = state.photo.gain.map((g) => g * light.unit);
     const { parts } = this.buffer(state.object.mesh), materials = parts.map((_, k) => state.materials[k] || state.object.materials[k]);
-    this.shadow(state, materials, view.eye, light, light_from_ref);
+    const painted = parts.map((_, k) => !state.materials[k] && state.object.painted[k]);
+    this.shadow(state, materials, painted, view.eye, light, light_from_ref);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.one.frame); gl.viewport(0, 0, size, size);
     gl.clearColor(0, 0, 0, 0); gl.clear(gl.DEPTH_BUFFER_BIT | gl.COLOR_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST); gl.disable(gl.BLEND);
@@ -395,7 +405,7 @@ class Renderer {
     gl.uniform1f(at("count"), count > QUICK ? count / OVERLAP : 1); gl.uniform1i(at("each"), Math.min(count, PER_PASS)); gl.uniform1f(at("texel"), 4 * Math.PI / (6 * light.size * light.size));
     for (const [k, part] of parts.entries()) {
       const material = this.data.materials[materials[k]];
-      gl.uniform3fv(at("k_d"), material.diffuse); gl.uniform3fv(at("k_s"), material.specular);
+      gl.uniform1i(at("painted"), painted[k] ? 1 : 0); gl.uniform3fv(at("k_d"), material.diffuse); gl.uniform3fv(at("k_s"), material.specular);
       gl.uniform1f(at("alpha"), Math.max(material.roughness * material.roughness, LEAST_ALPHA));
       gl.bindVertexArray(part.array); gl.drawElements(gl.TRIANGLES, part.count, gl.UNSIGNED_INT, 0);
     }
