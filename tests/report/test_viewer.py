@@ -248,12 +248,17 @@ def test_a_mesh_shows_its_parts_where_they_are(browser):
     assert changed - own == pytest.approx((white - brass) / 3, rel=0.05)
 
 
-@needs_chromium
-def test_controls_work_by_mouse_and_keys(browser):
-    page, _ = browser
+def choose_brass_ball(page) -> None:
+    """Choose a ball of brass in the light of noon."""
     page.select_option("[data-control=object]", label="a ball")
     page.select_option("[data-control=materials] select", label="brass")
     page.select_option("[data-control=light]", label="noon")
+
+
+@needs_chromium
+def test_controls_work_by_mouse_and_keys(browser):
+    page, _ = browser
+    choose_brass_ball(page)
     label = "document.querySelector('#viewer canvas').ariaLabel"
     page.wait_for_function(f"{label}.startsWith('a ball of brass in the light of noon')")
     page.focus("#viewer canvas")
@@ -277,6 +282,7 @@ def test_controls_work_by_mouse_and_keys(browser):
 def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
     page, _ = browser
     frames = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    choose_brass_ball(page)
     page.click("[data-control=reset]")
     page.evaluate("viewer.canvas.scrollIntoView()")
     page.evaluate(frames)  # a busy machine has the passes of the picture before until then
