@@ -95,9 +95,11 @@ def undetermined_by_observations(names: Sequence[str], problem: JointProblem) ->
                 ", and a smooth material in a soft light looks like a rough one in a sharp light. "
                 "A photo of it in other light"
             )
+            free = has_free_factor(problem.blocks, lights)
+            source = "by convention only" if free else "to about a quarter, by surroundings or light between surfaces"
             sentences.append(
                 f"material '{names[members[0]]}' shares no light with another: its colour and brightness are "
-                f"separated from the light's by convention only{consequence if len(lights) == 1 else '. A photo'} that "
+                f"separated from the light's {source}{consequence if len(lights) == 1 else '. A photo'} that "
                 "shows another material too would help"
             )
     return sentences

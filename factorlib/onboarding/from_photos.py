@@ -51,6 +51,7 @@ REVOLVED = (
     "every mask looks like a body of revolution, so `lathe: true` is written: if it is none, write "
     "`primitive: ball | box | cylinder` or `file: <mesh>` instead"
 )
+NAMES = "rename materials and meshes in dataset.yaml now, if at all: another name later makes all steps run again"
 NO_FOREGROUND = "draw masks: `make new`, then `make label`"
 ONE_LIGHT = (
     "one light at rest is assumed: where photos have different ones, delete `illumination: room`; where the thing "
@@ -120,7 +121,7 @@ def dataset_from_photos(
         if unknown := not cameras.source and not meshes:
             cameras = outlined_shape(visible, report)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
-    return missing + [SHAPE] * (unknown and not cameras.revolved), cameras.notes + doubts
+    return missing + [SHAPE] * (unknown and not cameras.revolved), [NAMES, *cameras.notes, *doubts]
 
 
 def read_views(

@@ -164,6 +164,11 @@ class ShadowMatch(msgspec.Struct, frozen=True):
     constant_light: float | None
     pixels: int
 
+    @property
+    def doubtful(self) -> bool:
+        """True if the photo's ground contradicts the predicted shadow."""
+        return self.correlation is not None and self.correlation < BELIEVED
+
     def __str__(self) -> str:
         if self.correlation is None:
             return (
@@ -176,7 +181,7 @@ class ShadowMatch(msgspec.Struct, frozen=True):
             f"The photo's shading of the ground correlates with the predicted one by {light}; "
             f"with that of a constant light by {shape}."
         )
-        return words if self.correlation >= BELIEVED else f"{words} So do not trust the shadow."
+        return f"{words} So do not trust the shadow." if self.doubtful else words
 
 
 class InsertionResult(msgspec.Struct, frozen=True):

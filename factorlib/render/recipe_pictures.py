@@ -47,6 +47,7 @@ SUN = (
     "The sun is assumed, not recovered: it stands in direction {sun.direction} of the light's map, {sun.size:g}° wide, "
     "and holds {sun.strength:.0%} of the light's energy, which is kept."
 )
+CONTRADICTED = "the ground that the photo shows is not shaded as the recovered light predicts"
 DENOISED = "Denoised by {denoiser}, from {recipe.samples} samples a pixel."
 
 
@@ -204,6 +205,8 @@ def write_insertion(
     covered = results.photo_mask(photo)
     result = insert_object(insertion, linear, covered, recipe.samples, lambda done: report(done / STEPS))
     match = compare_shadow(insertion, result, linear, covered, recipe.samples)
+    if match.doubtful:
+        log.warning("%s: do not trust the shadow: %s", photo, CONTRADICTED)
     # Pixels that the new object does not change keep the photo's values exactly.
     unchanged = (result.coverage[..., None] == 0) & (result.shadow == 1) & (insertion.ground.polish is None)
     _write_opaque(out / photo, np.where(unchanged, results.photo(photo), results.tone(photo)(result.composite)))

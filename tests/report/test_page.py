@@ -195,7 +195,7 @@ def test_a_doubtful_pose_says_why_and_what_to_do(report_page, tmp_path):
     inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"align": tmp_path / "align"})
     doubtful = page_of(inputs, tmp_path / "report")
     parsed(doubtful)
-    for words in ("mesh &lt;and&gt; mask differ", "left out of the solve", "0.905", "41° away", "is doubtful: &#39;balls&#39; in noon.", "<details open>",
+    for words in ("mesh &lt;and&gt; mask differ", "left out of the solve", "0.905", "41° away", "is doubtful: &#39;balls&#39; in noon.", "<details open><summary><h2>Poses",
                   "pose of an earlier result, the mesh's axes times 1.000, 1.050, 0.952"):  # fmt: skip
         assert words in doubtful and words not in html, words
     assert "keypoints" in doubtful
