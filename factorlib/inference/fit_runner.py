@@ -163,7 +163,7 @@ def solve_progress(progress: Progress, options: SolveOptions) -> EventReport:
         within = 1.0 if event.iteration < 0 else 1 - 0.25 ** (evaluations[event.phase] / phases[event.phase][0])
         cost_before = sum(costs[phase] for phase in list(phases)[: list(phases).index(event.phase)])
         furthest = max(furthest, min(cost_before + within * costs[event.phase], 0.999 * total))
-        progress(furthest, total, f"{event.phase} {event.iteration}: loss {event.loss:.3g}")
+        progress(furthest, total, event.phase)
 
     return report
 
