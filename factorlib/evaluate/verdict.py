@@ -3,17 +3,18 @@
 The expected mean square error of balls of the recovered materials in the recovered lights, shown as for the relit set
 score (`factorlib.evaluate.relighting`), is
 
-    e² = FLOOR + MATERIALS m² + CLIPPED c² + UNEXPLAINED √u + CONTOUR d          (1)
+    e² = FLOOR + MATERIALS m² + CLIPPED c² + UNEXPLAINED u^¾ + CONTOUR d²         (1)
 
 m²  squared change of a ball per standard error of each reflectance and of roughness, summed over these, mean over balls
 c   share of values that are clipped, mean over photos
 u   share of the shading that is not explained (`factorlib.inference.misfit`)
 d   distance between the outlines of meshes and masks (`contour_error` of poses.json), mean over objects
 
-and −10 log₁₀ e² is the expected score in dB.  The weights were fitted to 44 made sets of very different quality.
-`GOOD` and `POOR` were chosen on the same sets.  No set that scores less than 18 dB, as a flat disc of the mean colour
-does, is called good.  No set that scores 24 dB or more is called untrustworthy.  docs/verdict.md shows both on other
-sets (`python -m studies.measured.verdict`).
+and −10 log₁₀ e² is the expected score in dB.  Where no shading is explained, u = 1, a result is worth a flat colour,
+which gives UNEXPLAINED.  The other weights were fitted to 26 made sets of very different quality.  `GOOD` and `POOR`
+hold on these: no set that scores less than 18 dB, as a flat disc of the mean colour does, is called good, and no set
+that scores 24 dB or more is called untrustworthy, also where a set is left out of the fit (docs/verdict.md,
+`python -m studies.measured.verdict`).
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,11 +31,11 @@ from factorlib.results.metrics import Trust, Verdict
 
 # weights of (1)
 FLOOR = 1e-5
-MATERIALS = 0.28
-CLIPPED = 0.19
-UNEXPLAINED = 0.0186
-CONTOUR = 1.38
-DEVIATION = 3.0  # deviation of the scores from the expected one, dB
+MATERIALS = 0.217
+CLIPPED = 0.125
+UNEXPLAINED = 0.0141  # e² of 18.5 dB, the score of a flat colour
+CONTOUR = 230.0
+DEVIATION = 4.0  # deviation of the scores from the expected one, dB
 GOOD = 24.0  # least expected score of a good result, dB
 POOR = 19.0  # least expected score of a usable result, dB
 DISAGREES = 3.0  # residuals above which shapes and photos disagree, in units of their noise
@@ -95,8 +96,8 @@ class VerdictInputs(msgspec.Struct, frozen=True):
         return {
             "materials": MATERIALS * float(np.mean(list(self.materials.values()))),
             "clipped": CLIPPED * float(np.mean([photo.clipped for photo in self.photos.values()])) ** 2,
-            "unexplained": UNEXPLAINED * float(np.sqrt(self.unexplained)),
-            "contour": CONTOUR * float(np.mean(contours or [0.0])),
+            "unexplained": UNEXPLAINED * float(self.unexplained**0.75),
+            "contour": CONTOUR * float(np.mean(contours or [0.0])) ** 2,
         }
 
 

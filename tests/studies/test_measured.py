@@ -100,7 +100,10 @@ def test_deviations_between_two_runs_are_in_standard_errors_after_the_free_facto
 
 def test_weights_of_the_verdict_are_those_that_made_the_scores(tmp_path, monkeypatch, capsys):
     """Scores that follow the formula with other weights give these weights; every set has its row and its line."""
-    weights, terms = np.array([0.1, 0.3, 0.01, 0.5]), np.random.default_rng(0).uniform(0.01, 0.1, (12, 4))
+    weights, terms = (
+        np.array([0.1, 0.3, verdict.UNEXPLAINED, 0.5]),
+        np.random.default_rng(0).uniform(0.01, 0.1, (12, 4)),
+    )
     scores = verdict.expected_psnr(weights, terms).tolist()
     sets = [
         verdict.VerdictOnSet(f"way {k}", score, "good", 20.0 + k, row.tolist())
