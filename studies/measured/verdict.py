@@ -7,8 +7,7 @@ test   12 others: chairs of seeds 201 to 205, the last two in captured light, tw
        scores are expected with the shipped weights
 
 A set takes some minutes.  Sets lie in build/bench/verdict, results in build/.  For each kind it prints every set, rank
-correlations (Spearman), and the deviation; for `fit` also with each set left out of the fit.  Expected and true scores
-are written to build/bench/verdict/calibration.csv.
+correlations (Spearman), and the deviation; for `fit` also with each set left out of the fit.
 """
 
 import sys
@@ -22,7 +21,6 @@ from scipy.stats import spearmanr
 
 from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, MATERIALS, UNEXPLAINED
 from factorlib.images.light_map import maps_in
-from factorlib.wholefile import write_text
 from studies.measured.degradations import MIXED, MIXED_SOLIDS, degrade
 from studies.measured.eames_like import CAPTURED_SEEDS, SEEDS, generate_set, link_maps, split_maps
 from studies.measured.tools import ROOT, environment_words, evaluate_dataset, markdown_table
@@ -88,7 +86,7 @@ def fit_weights(sets: list[VerdictOnSet]) -> Float[np.ndarray, " 4"]:
     """Fit the weights, but UNEXPLAINED, that bring the expected scores nearest to the scores; outliers count less."""
     terms, scores = (np.array([getattr(each, key) for each in sets]) for key in ("terms", "score"))
     shipped = np.array(list(WEIGHTS.values()))
-    fitted = shipped != UNEXPLAINED
+    fitted = np.array([name != "unexplained" for name in WEIGHTS])
 
     def weights(logarithms: np.ndarray) -> np.ndarray:
         """Return all weights, from the logarithms of those that are fitted."""
@@ -111,7 +109,7 @@ def agreement(predicted: Float[np.ndarray, " n"], sets: list[VerdictOnSet]) -> s
 
 
 def main() -> None:
-    """Print the verdicts on the kinds of sets named on the command line, and write the scores of all."""
+    """Print the verdicts on the kinds of sets named on the command line."""
     kinds = {kind: measure(kind) for kind in sys.argv[1:] or CHAIRS}
     for kind, sets in kinds.items():
         ranked = sorted(sets, key=lambda each: -each.expected_psnr)
@@ -124,8 +122,6 @@ def main() -> None:
             expected_psnr(fit_weights([*sets[:k], *sets[k + 1 :]]), np.array(s.terms)) for k, s in enumerate(sets)
         ]
         print("each set left out of the fit:", agreement(np.array(left_out), sets))
-    lines = [f"{kind},{each.expected_psnr:.3f},{each.score:.3f}" for kind, sets in kinds.items() for each in sets]
-    write_text(PLACE / "calibration.csv", "\n".join(["kind,expected_db,true_db", *lines, ""]))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The stage `recipes`: the files of every kind, what they show, the same bytes again, and what it refuses."""
 
+import json
 from importlib.util import find_spec
 
 import msgspec
@@ -13,6 +14,7 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.recipe import kinds
+from factorlib.render.insertion import ShadowMatch
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.results.texture_table import FACTORS, FILE, TextureTable, write_factors
@@ -115,6 +117,17 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
     error = refusal("no object of the mesh 'egg' has the materials unseen", results.mesh, "egg", {"unseen": "red"}, "y")
     assert error.key == "material"
+
+
+@pytest.mark.parametrize("correlation, doubtful", [(0.29, True), (0.31, False), (None, False)])
+def test_a_shadow_that_the_photo_contradicts_is_a_warning_of_the_run(
+    grounded, tmp_path, monkeypatch, caplog, correlation, doubtful
+):
+    match = ShadowMatch(correlation, 0.1, 500)
+    monkeypatch.setattr("factorlib.render.recipe_pictures.compare_shadow", lambda *arguments: match)
+    drawn(grounded, tmp_path / "out", kinds.InsertRecipe(photos=["front"], samples=1))
+    caption = json.loads((tmp_path / "out" / "front.json").read_text())["caption"]
+    assert [words.count("do not trust the shadow") for words in (caption, caplog.text)] == [doubtful, doubtful]
 
 
 def test_the_photo_stays_where_no_object_is(inputs, tmp_path):
