@@ -31,7 +31,7 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.picture import picture
+from factorlib.images.picture import data_uri, picture
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import rotate_map
 from factorlib.pack import check_whole
@@ -50,7 +50,6 @@ from factorlib.render.photo_scene import (
 )
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
-from factorlib.report.pictures import data_uri
 from factorlib.results.materials import SolvedMaterial
 from factorlib.stage import Inputs, silent
 from factorlib.wholefile import write_bytes

@@ -93,9 +93,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for name, mesh in meshes.items():
         progress(next(counter), total, f"mesh {name}")
         overrides = [o.materials for each in objects.values() for o in each.objects if o.mesh == name and o.materials]
-        labels = {variant_name(each): files.read.mesh(name, mesh, each).face_label for each in overrides}
+        variants = {variant_name(each): files.read.mesh(name, mesh, each) for each in overrides}
         whole = files.read.mesh(name, mesh)
-        write_glb(out / f"{name}.glb", whole, names, materials, dict(sorted(labels.items())))
+        write_glb(out / f"{name}.glb", whole, names, materials, dict(sorted(variants.items())))
         write_ply(out / "meshes" / f"{name}.ply", whole)
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")

@@ -23,13 +23,12 @@ from typing import Any
 import msgspec
 import numpy as np
 import trimesh
-from jaxtyping import Int
-from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from factorlib.export.exported_scene import Sun
 from factorlib.export.texture_atlas import bake, unwrap
+from factorlib.images.picture import data_uri
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
@@ -49,71 +48,79 @@ def write_glb(
     mesh: Mesh,
     names: Sequence[str],
     materials: Mapping[str, Reflectance],
-    variants: Mapping[str, Int[np.ndarray, " f"]] = {},
+    variants: Mapping[str, Mesh] = {},
 ) -> None:
     """Write a mesh in its own frame and units, with the materials of its parts.
 
-    Detail of diffuse reflectance becomes an image, by which glTF multiplies the base colour of every variant.  Neither
-    may exceed 1.  The base colour takes the largest factor up to that limit; brighter texels are clamped.
+    Detail of diffuse reflectance becomes an image, which glTF multiplies by the base colour.  Neither may exceed 1.
+    The base colour takes the largest factor up to that limit; brighter texels are clamped.
 
     Args:
         path: the file to write
         mesh: the mesh
         names: label k is names[k − 1]
         materials: reflectances by name
-        variants: alternative labels of the faces, by variant name (KHR_materials_variants)
+        variants: the mesh with other labels and detail of the same faces, by variant name (KHR_materials_variants)
     """
     # one primitive per combination of the faces' own label and their labels in each variant
-    choices, choice = np.unique([mesh.face_label, *variants.values()], axis=1, return_inverse=True)
-    split = msgspec.structs.replace(mesh, face_label=choice.reshape(-1) + 1)
+    choices, choice = np.unique([each.face_label for each in (mesh, *variants.values())], axis=1, return_inverse=True)
     scene = trimesh.Scene()
-    parts = {}
-    for label in split.labels:
-        part = submesh(split, label)
-        selected = [names[k - 1] for k in choices[:, label - 1]]
-        name = selected[0] if selected[0] not in parts else f"{selected[0]} {label}"
-        factor = 1.0
-        texture = None
-        if part.detail is not None:
-            cores = [gltf_material(materials[each], True)["pbrMetallicRoughness"] for each in selected]
-            # values of the image in [0, 1]; the base colour takes their largest value, up to 1 itself
-            bases = [core["baseColorFactor"][:3] for core in cores]
-            factor = min(float(part.detail.max()), 1 / max(float(np.max(bases)), 1e-9))
-            part = unwrap(part)
-            texture = Image.fromarray(bake(part, 1 / factor))
-        visual = TextureVisuals(part.uv, PBRMaterial(name=name, baseColorTexture=texture))
+    parts: dict[str, list[dict[str, Any]]] = {}
+    images: list[str] = []
+    for label, selected in enumerate(choices.T, start=1):
+        whole = [
+            msgspec.structs.replace(each, face_label=choice.reshape(-1) + 1) for each in (mesh, *variants.values())
+        ]
+        versions = [submesh(each, label) for each in whole]
+        if any(each.detail is not None for each in versions):
+            versions = [unwrap(each) for each in versions]
+        chosen = [names[k - 1] for k in selected]
+        name = chosen[0] if chosen[0] not in parts else f"{chosen[0]} {label}"
+        part = versions[0]
+        visual = TextureVisuals(part.uv, PBRMaterial(name=name))
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
-        painted = part.detail is not None
-        parts[name] = [_entry(each, materials[each], mesh.open, painted, factor) for each in selected]
-    exact = partial(_set_materials, parts=parts, variants=list(variants))
+        parts[name] = [
+            _entry(each, materials[each], version, images) for each, version in zip(chosen, versions, strict=True)
+        ]
+    exact = partial(_set_materials, parts=parts, variants=list(variants), images=images)
     write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))
 
 
-def _entry(name: str, material: Reflectance, open_: bool, painted: bool, factor: float) -> dict[str, Any]:
-    """Return a material of the file, with its base colour times a factor."""
-    exact = gltf_material(material, painted)
-    base = exact["pbrMetallicRoughness"]["baseColorFactor"]
-    exact["pbrMetallicRoughness"]["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base[:3]), base[3]]
-    return {"name": name, "doubleSided": open_, **exact}
+def _entry(name: str, material: Reflectance, part: Mesh, images: list[str]) -> dict[str, Any]:
+    """Return a material of the file for a part; its image, if it is painted, is added to `images`."""
+    exact = gltf_material(material, part.detail is not None)
+    core = exact["pbrMetallicRoughness"]
+    if part.detail is not None:
+        base = core["baseColorFactor"][:3]
+        # values of the image in [0, 1]; the base colour takes their largest value, up to 1 itself
+        factor = min(float(part.detail.max()), 1 / max(*base, 1e-9))
+        core["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base), 1.0]
+        image = data_uri(bake(part, 1 / factor))
+        if image not in images:
+            images.append(image)
+        core["baseColorTexture"] = {"index": images.index(image)}
+    return {"name": name, "doubleSided": part.open, **exact}
 
 
 def _set_materials(
-    tree: dict[str, Any], parts: Mapping[str, Sequence[dict[str, Any]]], variants: Sequence[str]
+    tree: dict[str, Any],
+    parts: Mapping[str, Sequence[dict[str, Any]]],
+    variants: Sequence[str],
+    images: Sequence[str],
 ) -> None:
-    """Set the materials and variants of a glTF tree exactly.
+    """Set the materials, variants and images of a glTF tree exactly.
 
-    The mesh library rounds numbers to eight bits and knows no variants.  `parts` gives the materials of each mesh by
-    name: its own first, then one per variant.  All of a mesh have the texture that the library wrote for it.
+    The mesh library rounds numbers to eight bits, and knows neither variants nor their images.  `parts` gives the
+    materials of each mesh by name: its own first, then one per variant.
     """
-    written = tree["materials"]
     tree["materials"] = materials = []
+    if images:
+        tree["images"] = [{"uri": image} for image in images]
+        tree["textures"] = [{"source": number} for number in range(len(images))]
     for mesh in tree["meshes"]:
         numbers = []
-        core = written[mesh["primitives"][0]["material"]].get("pbrMetallicRoughness", {})
-        texture = {key: value for key, value in core.items() if key == "baseColorTexture"}
-        for plain in parts[mesh["name"]]:
-            entry = plain | {"pbrMetallicRoughness": plain["pbrMetallicRoughness"] | texture}
+        for entry in parts[mesh["name"]]:
             if entry not in materials:
                 materials.append(entry)
             numbers.append(materials.index(entry))

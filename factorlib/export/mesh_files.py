@@ -84,8 +84,14 @@ class MeshFiles:
                 write_ply(f"{file}.ply", part, shades)
                 write_usd_mesh(f"{file}{SUFFIX}", part)
         stem = self._stems[key]
-        painted = mesh.detail is not None
         return [
-            ExportedShape(f"{obj.name}.{name}", f"{stem}.{name}.ply", name, cam_from_object, mesh.open, painted)
+            ExportedShape(
+                f"{obj.name}.{name}",
+                f"{stem}.{name}.ply",
+                name,
+                cam_from_object,
+                mesh.open,
+                painted=f"{stem}.{name}.png" in self.images,
+            )
             for name in names.values()
         ]

@@ -3,6 +3,7 @@
 The palette gives each material a distinct colour in masks and tables, as near to its own as possible.
 """
 
+import base64
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,11 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
     pixels = np.asarray(pixels, dtype=np.uint8)
     # compression level 4 takes half the time of the default, 6, for 5 % more bytes
     return encode_pixels("picture.png", pixels, {"oiio:UnassociatedAlpha": 1, "png:compressionLevel": 4})
+
+
+def data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
+    """Return pixels as a PNG in a `data:` URI, for HTML and glTF."""
+    return "data:image/png;base64," + base64.b64encode(png_bytes(pixels)).decode("ascii")
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:

@@ -261,11 +261,11 @@ def write_ply(path: str | Path, mesh: Mesh, colours: np.ndarray | None = None) -
 
 
 def submesh(mesh: Mesh, label: int) -> Mesh:
-    """Return the faces of one material, with only the vertices that they use."""
+    """Return the faces of one material, with only the vertices that they use, and detail unless it is 1 everywhere."""
     keep = mesh.face_label == label
     used, index = np.unique(mesh.faces[keep], return_inverse=True)
     faces = index.reshape(-1, 3).astype(np.int32)
-    detail = None if mesh.detail is None else mesh.detail[used]
+    detail = None if mesh.detail is None or (mesh.detail[used] == 1).all() else mesh.detail[used]
     return Mesh(mesh.vertices[used], faces, mesh.normals[used], mesh.face_label[keep], mesh.open, detail)
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.images.picture import exposure_of, picture
+from factorlib.images.picture import data_uri, exposure_of, picture
 from factorlib.pack import check_whole
 from factorlib.report.artifacts import STAGES, Artifacts, Picture
-from factorlib.report.pictures import data_uri, downsample
+from factorlib.report.pictures import downsample
 from factorlib.report.template import DASH, headlines, number, percent, render_template
 from factorlib.results.materials import MaterialTable, SolvedMaterial, read_materials
 from factorlib.results.photos import read_photos

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
-from factorlib.images.picture import read_png
+from factorlib.images.picture import data_uri, read_png
 from factorlib.jsonfile import read_json
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
@@ -178,7 +178,7 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
     if pixels is None:
         return None
     crop = pixels[pictures.mask_box(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
-    return pictures.data_uri(pictures.downsample(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
+    return data_uri(pictures.downsample(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
 
 
 # ── Training ─────────────────────────────────────────────────────────────────────────────────────────────────────────

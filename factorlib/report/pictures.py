@@ -1,6 +1,5 @@
 """Pictures of the report: photos beside re-syntheses, balls, reflectance maps, and lights."""
 
-import base64
 from collections.abc import Mapping, Sequence
 from math import ceil
 from typing import Any
@@ -16,7 +15,7 @@ from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.evaluate.picture_errors import agreeing_pixels
 from factorlib.images.exr import read_exr
-from factorlib.images.picture import exposure_of, nearest_tags, picture, png_bytes
+from factorlib.images.picture import data_uri, exposure_of, nearest_tags, picture, png_bytes
 from factorlib.images.tone import srgb_encode
 from factorlib.render.photo_scene import TracedPicture, rotate_light, traced_photo
 from factorlib.render.solved_set import SolvedSet
@@ -38,11 +37,6 @@ CLAY_LIGHT = np.array([-0.5, -0.6, -0.6245])  # camera frame, unit: from above, 
 LEAST_OBSERVED = 0.002  # share of a disc below which observed normals are not outlined
 
 Pixels = UInt8[np.ndarray, "h w c"]
-
-
-def data_uri(pixels: Pixels) -> str:
-    """Return pixels as a PNG in a `data:` URI, for the `src` of an image."""
-    return "data:image/png;base64," + base64.b64encode(png_bytes(pixels)).decode("ascii")
 
 
 def downsample(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray, "H W c"]:

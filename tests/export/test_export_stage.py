@@ -1,14 +1,17 @@
 """The stage `export`: gauge, files and bytes; materials as MaterialX and glTF, and what other programs show of them."""
 
+import base64
 import json
 import struct
 import xml.etree.ElementTree as ET
+from io import BytesIO
 
 import msgspec
 import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
@@ -231,7 +234,9 @@ def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
     own, other = np.array([1, 1, 3, 3, 1], np.int16), np.array([1, 2, 3, 3, 2], np.int16)
     mesh, names = Mesh(vertices, faces, np.tile([0.0, 0, 1], (15, 1)), own), ["bright", "lambertian", "metal"]
     dark = np.full(5, 3, np.int16)
-    write_glb(tmp_path / "a.glb", mesh, names, CASES, {"legs: lambertian": other, "all dark": dark})
+    choices = {"legs: lambertian": other, "all dark": dark}
+    variants = {name: msgspec.structs.replace(mesh, face_label=labels) for name, labels in choices.items()}
+    write_glb(tmp_path / "a.glb", mesh, names, CASES, variants)
     tree, result = read_tree(tmp_path / "a.glb"), trimesh.load(tmp_path / "a.glb").geometry
     parts = read_parts_of_glb(tmp_path / "a.glb")
     variants = tree["extensions"]["KHR_materials_variants"]["variants"]
@@ -252,20 +257,25 @@ def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
     assert {name: part.materials for name, part in parts.items()} == {n: {"": n} for n in ("bright", "metal")}
 
 
-def test_variants_share_the_detail_of_reflectance_exactly(tmp_path):
-    """Base colour times the image at a vertex is the reflectance times the detail, in each variant."""
+def test_every_variant_has_its_own_paint(tmp_path):
+    """Base colour times the image at a vertex is the reflectance times the detail of the variant; plain ones have none."""
     detail, labels = np.array([[0.4, 0.5, 0.6], [0.8, 0.7, 0.6], [1.05, 1.0, 0.9]]), np.array([1], np.int16)
     mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.tile([0.0, 0, 1], (3, 1)), labels, detail=detail)
-    write_glb(
-        tmp_path / "a.glb", mesh, ["bright", "lambertian", "metal"], CASES, {"dim": labels + 1, "bare": labels + 2}
-    )
+    dim = msgspec.structs.replace(mesh, face_label=labels + 1, detail=detail[::-1] * 1.5)
+    bare = msgspec.structs.replace(mesh, face_label=labels + 2, detail=np.ones((3, 3)))
+    write_glb(tmp_path / "a.glb", mesh, ["bright", "lambertian", "metal"], CASES, {"dim": dim, "bare": bare})
     ((_, part),) = trimesh.load(tmp_path / "a.glb").geometry.items()
     source = np.abs(part.vertices[:, None] - mesh.vertices).sum(-1).argmin(1)
-    shade = colours_at(np.asarray(part.visual.material.baseColorTexture), part.visual.uv)
-    for entry in read_tree(tmp_path / "a.glb")["materials"]:
-        material = CASES[entry["name"]]
-        base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3]) * (1 - max(material.specular))
-        np.testing.assert_allclose(base * shade, detail[source] * material.diffuse, atol=0.005)
+    tree = read_tree(tmp_path / "a.glb")
+    assert [entry["name"] for entry in tree["materials"]] == ["bright", "lambertian", "metal"]
+    for entry, each in zip(tree["materials"][:2], (mesh, dim), strict=True):
+        material, core = CASES[entry["name"]], entry["pbrMetallicRoughness"]
+        uri = tree["images"][tree["textures"][core["baseColorTexture"]["index"]]["source"]]["uri"]
+        with Image.open(BytesIO(base64.b64decode(uri.partition(",")[2]))) as image:
+            shade = colours_at(np.asarray(image), part.visual.uv)
+        base = np.array(core["baseColorFactor"][:3]) * (1 - max(material.specular))
+        np.testing.assert_allclose(base * shade, each.detail[source] * material.diffuse, atol=0.005)
+    assert "baseColorTexture" not in tree["materials"][2]["pbrMetallicRoughness"]
 
 
 def read_tree(path) -> dict:
