@@ -82,7 +82,7 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Octahedral
     mesh, pose = perturb_pose(name, true_pose, case.objects, rng)
     outline = Silhouette(true_maps.label.astype(np.int16))
     maps = rasterise(mesh, CAMERA, fit_outline(mesh, pose, outline) if case.objects.refined else pose)
-    weights = confidence(maps, outline) if case.objects.confidence else np.ones(maps.label.shape)
+    weights = confidence(maps, outline)
     covered = (true_maps.label > 0) & (maps.label > 0) & (weights > 0) & (maps.normal @ FRONT > GRAZING)
     pixels = np.sort(rng.permutation(np.flatnonzero(covered.reshape(-1)))[: case.objects.pixels])
     true, normals = (each.normal.reshape(-1, 3)[pixels] for each in (true_maps, maps))

@@ -24,10 +24,7 @@ class Objects(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shifted:     shift in a random direction of the image, as a share of the mesh's diameter
     larger:      how much larger the mesh is, as a share of its size
     triangles:   triangles of the mesh that stands for the body; None: all of its 20,000
-    confidence:  whether the solve gets the confidence of each normal, as the stage `align` writes it
     refined:     whether every pose is first fitted to the outline of its mask, from the perturbed pose
-    warm:        whether it starts from the solution of all photos but the last (the parameter `start` of the stage
-                 `solve`)
     """
 
     pixels: int
@@ -35,9 +32,7 @@ class Objects(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shifted: float = 0.0
     larger: float = 0.0
     triangles: int | None = None
-    confidence: bool = True
     refined: bool = False
-    warm: bool = False
 
 
 class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -198,7 +193,7 @@ class Scale(msgspec.Struct, frozen=True):
 
 
 SMALL = {"cells": 24, "splittings": 0, "observations": 100}  # a solve that takes seconds and shows that a study runs
-FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=len(NAMES), side=3, size=32, solve={})
+FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=len(NAMES), side=3, size=32, solve={"splittings": 0})
 QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=SMALL, light_rows=32, light_spp=8)
 
 

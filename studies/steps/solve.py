@@ -2,7 +2,7 @@
 
 measured.json holds the processor seconds of the solve, summed over threads, from reading the observations to writing
 materials and lights.  For objects it also holds the mean error of the given normals.  Seconds are a measurement: they
-differ from run to run.  An earlier solve to start from does not count in them.
+differ from run to run.
 """
 
 import time
@@ -26,10 +26,7 @@ from studies.study import Case, Comparison
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Render, perturb, and solve with the parameters that the case names; other methods of a comparison do not solve.
-
-    The solve starts from nothing, or from the solution of all photos but the last.
-    """
+    """Render, perturb, and solve with the parameters of the case; other methods of a comparison do not solve."""
     facts = inputs.facts["dataset.case"]
     case = msgspec.convert(facts, Comparison if "method" in facts else Case)
     (home := out / inputs.photo).mkdir()
@@ -42,14 +39,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             tables, measured["normals"] = objects.observe_objects(case, materials, lights)
         else:
             tables = spheres.observe_spheres(case, materials, lights)
-        with TemporaryDirectory() as folder:
-            start = {}
-            if case.objects and case.objects.warm:
-                # the two solves must not resume each other's
-                fresh_inputs = msgspec.structs.replace(inputs, unfinished=None)
-                run_solve(dict(list(tables.items())[:-1]), case.solve, fresh_inputs, Path(folder), progress)
-                start = {"start": Path(folder)}
-            measured["seconds"] = run_solve(tables, case.solve, inputs, home, progress, **start)
+        measured["seconds"] = run_solve(tables, case.solve, inputs, home, progress)
     write_json(home / "measured.json", measured)
 
 
@@ -59,7 +49,6 @@ def run_solve(
     inputs: Inputs,
     out: Path,
     progress: Progress,
-    **start: Path,
 ) -> float:
     """Solve observations by the stage's parameters, each photo in a light of its own; return the processor seconds."""
     lights = {name: msgspec.to_builtins(LightSlice(name, None)) for name in tables}
@@ -67,7 +56,7 @@ def run_solve(
     with TemporaryDirectory() as folder:
         for name, table in tables.items():
             write_observations(Path(folder) / f"{name}.parquet", table)
-        folders = {"urm": Path(folder), "train": SHIPPED, **start}
+        folders = {"urm": Path(folder), "train": SHIPPED}
         start_s = time.process_time()
         stage_inputs = Inputs(folders, facts, map=inputs.map, unfinished=inputs.unfinished)
         solve.main(msgspec.convert(parameters, solve.Params), stage_inputs, out, progress)

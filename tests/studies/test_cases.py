@@ -46,10 +46,10 @@ def test_a_perturbation_changes_what_is_told_and_not_what_is_shown():
 # ── objects ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_case_from_lights_to_scores_warm(tmp_path):
-    """By its steps, without a runner: two photos, the second added to a solution of the first."""
+def test_a_case_from_lights_to_scores(tmp_path):
+    """By its steps, without a runner: two photos."""
     how = {"cells": 24, "splittings": 0, "observations": 100}
-    case, world = Case(0, ((0, 0), (0, 1)), 10, how, objects=Objects(60, warm=True)), World((0,), 3, 8, 1)
+    case, world = Case(0, ((0, 0), (0, 1)), 10, how, objects=Objects(60)), World((0,), 3, 8, 1)
     folders = {name: tmp_path / name for name in ("worlds", "solve", "score")}
     for folder in folders.values():
         folder.mkdir()
