@@ -135,13 +135,15 @@ class SetResult(NamedTuple):
         return float(np.sqrt(np.square(errors).mean())), float(np.sqrt(np.square(nulls).mean()))
 
 
-def generate_set(seed: int, lights: Path | None = None, kind: str = "eames") -> Path:
+def generate_set(seed: int, lights: Path | None = None, kind: str = "eames", painted: bool = False) -> Path:
     """Return the folder of the set of a seed; generate it if it is missing or if factorlib/generate has changed."""
     sources = sorted(path for path in (ROOT / "factorlib/generate").iterdir() if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
-    folder = PLACE / digest / ("captured" if lights else "made") / f"{kind}-like-{seed}"
+    name = f"{kind}-like-{seed}" + ("-painted" if painted else "")
+    folder = PLACE / digest / ("captured" if lights else "made") / name
     if not (folder / "dataset.yaml").exists():
         options = ["--seed", str(seed), "--out", str(folder), *(["--lights", str(lights)] if lights else [])]
+        options += ["--painted"] if painted else []
         subprocess.run([sys.executable, "-m", "factorlib.generate", kind, *options], cwd=ROOT, check=True)
     return folder
 
@@ -190,12 +192,12 @@ def run_pipeline(name: str, dataset: Path, root: Path = ROOT) -> SetResult:
     return SetResult(name, evaluate_dataset(dataset, root, FACTORLIB_STORE=str(store)), root / "build" / dataset.name)
 
 
-def run_captured(seed: int, folders: Sequence[Path]) -> SetResult:
+def run_captured(seed: int, folders: Sequence[Path], painted: bool = False) -> SetResult:
     """Return the set of a seed in captured lights, solved under a prior that was fitted to other maps."""
     folder = PLACE / f"captured-{seed}"
     maps, others = split_maps(maps_in(folders), seed)
     print(f"set {seed} is lit by {', '.join(m.name for m in maps)}", flush=True)
-    dataset = generate_set(seed, link_maps(maps, folder / "maps"))
+    dataset = generate_set(seed, link_maps(maps, folder / "maps"), painted=painted)
     return run_pipeline(f"{seed}, captured", dataset, project_with_prior(others, folder / "project"))
 
 

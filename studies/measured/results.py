@@ -24,6 +24,7 @@ PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
     "reference": "data/synthetic",
     "eames_like": "data/eames, and sets made alike",
+    "painted": "Painted sets",
     "operator": "Reflection operators",
     "align": "Poses",
     "real_poses": "Poses of real photographs",
