@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any
 
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # Open3D would start it in every notebook.
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = ["__version__", "load_result"]
 
 

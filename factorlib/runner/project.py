@@ -284,6 +284,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the folder is
              one of the inputs, and the key has the files' contents, not their location
     shipped: result that ships with the source, copied if it was made by the same modules and parameters
+    presets: parameters by the name of a preset, which the setting `<stage>.preset=<name>` stands for
     """
 
     inputs: list[str] = []
@@ -298,6 +299,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     given: dict[str, list[str]] = {}
     shipped: Shipping | None = None
     params: dict[str, Any] = {}
+    presets: dict[str, dict[str, Any]] = {}
 
     @property
     def slices(self) -> list[str]:
@@ -396,8 +398,13 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
     """Replace values of the pipeline by settings `stage.parameter=value` and `executor=…`, several separated by blanks.
 
+    `stage.preset=name` stands for the parameters of a preset; a later setting replaces one of these.
+
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}
+    >>> pipeline = Pipeline(1, {"solve": Stage(presets={"fast": {"lobes": 8, "steps": 2}})})
+    >>> with_settings(pipeline, ["solve.preset=fast solve.steps=3"]).stages["solve"].params
+    {'lobes': 8, 'steps': 3}
     """
     stages = dict(pipeline.stages)
     executor = pipeline.executor
@@ -414,6 +421,12 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
         if stage not in stages:
             raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
         table = params = dict(stages[stage].params)
+        if names == ["preset"]:
+            if text not in (presets := stages[stage].presets):
+                cure = did_you_mean(text, presets) if presets else "leave it out: this stage has none"
+                raise InputError(f"the stage {stage} has no preset {one_line(text)!r}", key=key, cure=cure)
+            stages[stage] = msgspec.structs.replace(stages[stage], params=params | presets[text])
+            continue
         for name in names[:-1]:
             inner = table.get(name)
             table[name] = dict(inner) if isinstance(inner, dict) else {}

@@ -109,7 +109,11 @@ def test_plan_why_and_graph_show_the_same_plan(project, capsys):
 
 
 def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(project, capsys):
-    for setting, words in (("tabel.scale=3", "did you mean 'table'"), ("table.scale", "stage.parameter=value")):
+    for setting, words in (
+        ("tabel.scale=3", "did you mean 'table'"),
+        ("table.scale", "stage.parameter=value"),
+        ("table.preset=fast", "no preset 'fast'"),
+    ):
         with pytest.raises(InputError) as caught:
             make(project, setting)
         assert words in str(caught.value) and "pipeline.yaml" not in str(caught.value)

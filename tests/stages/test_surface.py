@@ -102,7 +102,7 @@ def test_a_held_out_photo_takes_no_part_whatever_it_shows(tmp_path):
     for name, shown in {"one": dusk, "other": other}.items():
         write_observations(inputs["urm"] / "dusk.parquet", shown)
         (tmp_path / name).mkdir()
-        surface.main(surface.Params(observations=200), inputs, tmp_path / name, silent)
+        surface.main(surface.Params(observations=60), inputs, tmp_path / name, silent)
         results.append([(tmp_path / name / file).read_bytes() for file in ("surface.json", "beginning.json")])
     assert results[0] == results[1]
 
