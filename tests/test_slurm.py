@@ -30,6 +30,7 @@ def cluster(example, tmp_path):
         yield result
 
 
+@pytest.mark.long
 def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(cluster, tmp_path):
     """Every line of it but the interpreter's path, which is that of the tests."""
     script = cluster.job_script().replace(f"{LIBRARY}/.venv/bin/python", sys.executable)

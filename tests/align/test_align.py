@@ -56,7 +56,7 @@ def answered(mesh, seed=21, mask=None, given=None, known=True, **how):
     return error, reasons, result.estimates[0]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_any_rotation_with_the_focal_length_unknown(seed):
     mesh, focal = [blob(), chair()][seed % 2], [0.9, 1.4, 2.2][seed]
     estimate, error = searched(mesh, seed, known=False, search=SearchOptions(), focal=focal, shift=(0.05, -0.04))
@@ -99,6 +99,7 @@ def test_a_flat_plate_is_right_or_doubted(seed):
     assert error < 2 or reasons
 
 
+@pytest.mark.long
 def test_too_few_pixels_a_mask_of_the_whole_photo_and_a_mirrored_one_are_doubted():
     assert 10 <= true_silhouette(*photo_of(chair(), 21, fill=0.04)).inside.sum() <= 40
     assert any("tells normals" in reason for reason in answered(chair(), known=False, fill=0.04)[1])
@@ -300,6 +301,7 @@ def test_more_labels_than_parts_and_none_tell_nothing(kinds):
     assert match_parts(LAMP, 2, [Silhouette(np.where(label > 0, stripes, 0).astype(np.int16))]) == [None]
 
 
+@pytest.mark.long
 def test_two_labels_among_four_parts_are_paired_although_there_are_fifty_pairings():
     tower = boxes(*[((0.2 + 0.2 * k, 0.2, 0.3), (0.1 * k, 0.4 * k, 0)) for k in range(4)])
     (paired,) = match_parts(tower, 4, [silhouette_of(tower, (1, 1, 2, 2), 1)])

@@ -56,7 +56,7 @@ def whole_pixels(label: np.ndarray) -> np.ndarray:
     return np.any([binary_erosion(label == k, np.ones((3, 3))) for k in np.unique(label[label > 0])], axis=0)
 
 
-@pytest.mark.parametrize("photo", ["front", "side"])
+@pytest.mark.parametrize("photo", [pytest.param("front", marks=pytest.mark.long), "side"])
 def test_scene_equals_resynthesis(exported, photo):
     inputs, out = exported
     geometry, masks = (read_exr(inputs[stage] / f"{photo}.exr") for stage in ("align", "masks"))

@@ -52,7 +52,9 @@ MESHES = {
 }
 
 
-@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name == "fine ball")) for name in MESHES]
+)
 def test_image_has_each_vertex_colour_and_every_face_a_place_in_it(name):
     mesh = painted(MESHES[name])
     result = unwrap(mesh)

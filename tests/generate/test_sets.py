@@ -118,6 +118,7 @@ def office(tmp_path_factory) -> list[Path]:
     return [made_chairs(folder / str(painted), names, 32, exact=True, painted=painted) for painted in (False, True)]
 
 
+@pytest.mark.long
 def test_the_same_seed_is_the_same_paint(office, tmp_path):
     again = made_chairs(tmp_path / "again", ("office",), 32, exact=True, painted=True)
     assert files_of(again) == files_of(office[1])

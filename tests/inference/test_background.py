@@ -99,6 +99,7 @@ def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_
     assert not any(each.accepted for each in off.backgrounds) and log_scale(off) > error + 0.1
 
 
+@pytest.mark.long
 def test_where_no_background_is_kept_the_answer_is_that_without_backgrounds(lit):
     doubtful = lit.with_blocks([darkened(block) for block in lit.blocks]).keep_backgrounds([False, True, False])
     with_one, without = (solve(each, start_from_photos(3), QUICK) for each in (doubtful, lit.without_backgrounds()))

@@ -260,6 +260,7 @@ def paper_solved():
     return blocks, paper_fit(blocks)
 
 
+@pytest.mark.long
 def test_roughly_recovers_the_materials_and_the_radiance_it_was_rendered_with(paper_solved):
     blocks, result = paper_solved[0], paper_solved[1].point
     factor, rough = factor_between(result.materials, MATERIALS), result.materials.roughness

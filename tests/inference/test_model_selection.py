@@ -82,6 +82,7 @@ def lit():
     return [blocks_of_observations(observed, Noise(0.02, 0.02))[0] for observed in lit_rooms(20)]
 
 
+@pytest.mark.long
 def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(shaded):
     error = {}
     for choice in ("off", "auto"):
@@ -172,6 +173,7 @@ def curved():
     return [through(data, exponent) for data, exponent in zip(rooms(size=20), (1.3, 0.8, 1.0), strict=True)]
 
 
+@pytest.mark.long
 def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
     result, without = (solved(curved, MANY, tone=tone) for tone in ("auto", "off"))
     exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(result)]
@@ -188,6 +190,7 @@ def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_loss
         )
 
 
+@pytest.mark.long
 def test_photos_of_one_light_have_a_curve_each():
     blocks = [through(data, 1.0, 1.3) if k == 0 else data for k, data in enumerate(rooms(photos=2, size=14))]
     off = np.log(exponents_of(solved(blocks, MANY))[0]) - np.log((1.0, 1.3))
@@ -258,6 +261,7 @@ def photographed_at(*curvatures):
     return blocks
 
 
+@pytest.mark.long
 def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     blocks = photographed_at(0.2, 0.0, 0.2)
     result, far = (solved(blocks, MANY, tone="off", distance=distance) for distance in ("auto", "off"))

@@ -177,6 +177,7 @@ def errors(normals: np.ndarray, true: np.ndarray) -> float:
     return float(np.median(np.degrees(np.arccos(np.clip(np.sum(normals * true, 1), -1, 1)))))
 
 
+@pytest.mark.long
 def test_dents_that_the_object_has_not_are_found_in_three_lights():
     what, body, given, true = on_spheres(3, 0.15, 1)
     assert what.evidence.accepted and sum(what.gains.values()) > 0 and not what.painted.accepted
@@ -212,6 +213,7 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
         np.testing.assert_allclose(after[~dented], shown.normal[~dented], atol=1e-12)
 
 
+@pytest.mark.long
 def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     true = [on_even_cells(drawn(k, 120)) for k in range(3)]
     body, problem = surfaces(), spheres(true, size=13)

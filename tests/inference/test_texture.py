@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
+from scipy.sparse.linalg import spsolve
 
 from factorlib.generate.solids import sphere
 from factorlib.inference import texture
@@ -59,13 +60,13 @@ def test_the_texture_is_the_minimum_of_its_system(monkeypatch):
     monkeypatch.setattr(texture, "CG_TOLERANCE", 1e-10)
     monkeypatch.setattr(texture, "CG_ITERATIONS", 5000)
     samples = [pixels(PAINT, seed, count=500) for seed in (0, 1)]
-    system = 0.3 * LAPLACIAN.toarray() + PULL * np.eye(BODY.nodes)
+    system = csc_array(0.3 * LAPLACIAN + PULL * eye_array(BODY.nodes))
     target = np.full((BODY.nodes, 3), PULL)
     for one in samples:
-        B = one.operator.toarray()
-        system += B.T @ (one.weight[:, None] * B)
-        target += B.T @ (one.weight[:, None] * one.ratio)
-    np.testing.assert_allclose(solve_texture(samples, LAPLACIAN, 0.3), np.linalg.solve(system, target), atol=1e-6)
+        weighted = one.operator.T @ diags_array(one.weight)
+        system = system + weighted @ one.operator
+        target += weighted @ one.ratio
+    np.testing.assert_allclose(solve_texture(samples, LAPLACIAN, 0.3), spsolve(csc_array(system), target), atol=1e-6)
 
 
 def test_what_no_photo_shows_continues_what_is_around():

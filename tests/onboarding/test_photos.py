@@ -52,6 +52,7 @@ def cut_outs(tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 def test_cut_outs_with_poses_become_a_valid_dataset_with_a_hull_and_a_focal_length_without_a_click(cut_outs):
     steps = []
     arguments = cut_outs / "capture", None, None, lambda share, text: steps.append(share)

@@ -266,6 +266,7 @@ def blocks(picture):
     return picture.reshape(12, 4, 16, 4, 3).mean(axis=(1, 3))
 
 
+@pytest.mark.long
 def test_the_composite_is_the_photo_of_the_scene_with_the_object(inserted):
     """Shadow on a ground of unknown texture, the object itself, its light on its neighbour: within the noise and the ground's mean colour."""
     photo, result = inserted
@@ -280,6 +281,7 @@ def test_the_composite_is_the_photo_of_the_scene_with_the_object(inserted):
     assert STRIPES[0] < result.ground.mean() < STRIPES[1]
 
 
+@pytest.mark.long
 def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_object_and_only_there(inserted):
     photo, result = inserted
     brighter = PhotoScene(CAMERA, (THERE,), light().scale(2.0), MATERIALS)

@@ -221,7 +221,10 @@ def ball_maps(size: int) -> tuple[dict, dict]:
     return {"label": inside.astype(float)}, geometry
 
 
-@pytest.mark.parametrize("roughness, share", [(0.15, 1.0), (0.3, 0.8), (0.6, 0.3)])
+@pytest.mark.parametrize(
+    "roughness, share",
+    [pytest.param(0.15, 1.0, marks=pytest.mark.long), pytest.param(0.3, 0.8, marks=pytest.mark.long), (0.6, 0.3)],
+)
 def test_interpolated_pixels_are_those_that_the_operator_gives(roughness, share, monkeypatch):
     """Of a large ball, of which only a share is evaluated: the rim, and more with narrower highlights."""
     photo, geometry = ball_maps(200)

@@ -300,6 +300,7 @@ def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
     assert np.median(np.abs(np.asarray(shot).astype(float)[inside] - want)) < 3
 
 
+@pytest.mark.long
 @needs_chromium
 def test_no_object_burns_out(browser):
     """However bright the photo is, 98 % of the object's pixels come to at most 0.9; a dim one keeps its exposure, and no view changes either."""

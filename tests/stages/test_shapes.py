@@ -25,6 +25,7 @@ def test_a_hull_is_refused_where_nothing_tells_the_focal_length():
     refusal("focal lengths", shapes.estimate_shape, MeshEntry(hull=True, material="red"), posed, shapes.Params(), print)
 
 
+@pytest.mark.long
 def test_photos_and_masks_of_a_body_at_rest_give_cameras_a_hull_and_normals(tmp_path):
     body, photos, folder = SHAPES["blob"](), [], tmp_path / "set"
     for name, view in views_of(body, AROUND, AROUND, 320).items():

@@ -119,6 +119,7 @@ def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_p
     assert {p.stem for p in (out / "coverage").glob("*.exr")} == {"a", "b"}
 
 
+@pytest.mark.long
 def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, linked, solved):
     def hidden(part, kind):
         random = np.random.default_rng(0).integers(0, 2, (len(part), 128))

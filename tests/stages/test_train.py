@@ -26,6 +26,7 @@ def trained(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_brief_training_already_beats_the_formula_and_says_how(trained):
     accuracy = json.loads((trained / "accuracy.json").read_text())["specular"]
     assert accuracy["median"] < 0.013  # the formula's own, see tests/reflection

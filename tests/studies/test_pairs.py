@@ -41,6 +41,7 @@ HALF = {"light": 2.0, "materials": lambda m: scale_reflectance(m, np.full(3, 0.5
 WRONG = [({}, ""), (HALF, ""), ({"light": 0.4}, "light"), ({"materials": mixed}, "material"), ({"tilt": 0.5}, "ground")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how, cause", WRONG, ids=["same", "gauge", "light", "material", "ground"])
 def test_what_is_right_is_not_told_apart_and_what_is_wrong_is_named(inputs, how, cause):
     recipe = InsertRecipe(mesh="ball", material="red", at=(46.0, 45.0), size=0.5, samples=4)
