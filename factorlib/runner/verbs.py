@@ -213,8 +213,8 @@ def show_params(project: Project, stages: list[str] | None) -> int:
         for param, values, default, text in parameters(params) or [("", "none", "", "It has no parameters.")]:
             print(f"{name}.{param} = {default}    ({values})" if param else name)
             print(textwrap.fill(text, 100, initial_indent="    ", subsequent_indent="    "))
-        for preset, values in pipeline.stages[name].presets.items():
-            print(f"{name}.preset={preset} stands for", *(f"{name}.{key}={value}" for key, value in values.items()))
+        for preset, settings in pipeline.stages[name].presets.items():
+            print(f"{name}.preset={preset} stands for", *(f"{name}.{key}={value}" for key, value in settings.items()))
     return 0
 
 

@@ -7,18 +7,14 @@ docs/gallery.md and the outputs of docs/result.ipynb.
 """
 
 import os
-import subprocess
 import sys
 import time
-import tomllib
-from datetime import date
 from importlib import import_module
-from pathlib import Path
 
 import torch
 
 from factorlib.errors import InputError, did_you_mean
-from studies.measured.tools import ROOT, Tables, markdown_table, replace_sections
+from studies.measured.tools import ROOT, Tables, machine, markdown_table, replace_sections
 
 PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
@@ -31,15 +27,6 @@ SECTIONS = {  # module -> title
     "real_sets": "Re-synthesis of real photographs",
 }
 PAGES = ("gallery", "notebook")  # modules whose `write()` makes a page of its own
-
-
-def machine() -> str:
-    """Return the version, commit, date and kind of machine of this run."""
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
-    facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
-    model = next((line.partition(":")[2].strip() for line in facts.splitlines() if line.startswith("model name")), "?")
-    return f"Version {version}, commit {git.stdout.strip() or 'unknown'}, {date.today()}, {os.cpu_count()} × {model}"
 
 
 def section(name: str, tables: Tables, measured: str) -> str:

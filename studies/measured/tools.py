@@ -3,7 +3,9 @@
 import os
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterable, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,15 @@ from factorlib.wholefile import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 Tables = dict[str, list[list[str]]]  # title -> rows of cells, the head first
+
+
+def machine() -> str:
+    """Return the version, commit, date and kind of machine of this run."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
+    facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    model = next((line.partition(":")[2].strip() for line in facts.splitlines() if line.startswith("model name")), "?")
+    return f"Version {version}, commit {git.stdout.strip() or 'unknown'}, {date.today()}, {os.cpu_count()} × {model}"
 
 
 def format_number(value: float, digits: int = 2) -> str:

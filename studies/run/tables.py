@@ -11,7 +11,7 @@ from factorlib.runner.project import LIBRARY, Project
 from factorlib.wholefile import replace_file
 from studies.catalogue import STUDIES
 from studies.conclusion import Conclusion, claims, conclude, csv_text, numbers, paragraph
-from studies.measured.tools import markdown_table, replace_sections
+from studies.measured.tools import machine, markdown_table, replace_sections
 from studies.run import studies
 from studies.study import FULL, Scale, Score, Study
 
@@ -51,7 +51,11 @@ def conclusions(project: Project) -> dict[str, Conclusion]:
 def refresh_docs(names: Sequence[str]) -> None:
     """Write tables and answers of full studies, and the table of all answers to the paper, into docs/studies.md."""
     tables = conclusions(studies(FULL))
-    sections = {n: f"{numbers(tables[n], MOST_MEASURES)}\n\n{claims(tables[n])}" for n in names if n in tables}
+    sections = {
+        n: f"*{machine()}; `make study STUDY={n}`*\n\n{numbers(tables[n], MOST_MEASURES)}\n\n{claims(tables[n])}"
+        for n in names
+        if n in tables
+    }
     answers = {name: table.answer for name, table in tables.items()}
     replace_sections(DOCS, {"conclusions": answers_to_paper(answers, DOCS.read_text(encoding="utf-8"))} | sections)
 
