@@ -13,7 +13,7 @@ from factorlib.errors import InputError
 from factorlib.wholefile import writing
 
 NEEDED = ("report", "export", "masks", "align")
-STAGES = (*NEEDED, "evaluate", "render", "shapes", "solve", "surface", "texture")
+STAGES = (*NEEDED, "evaluate", "recipes", "render", "shapes", "solve", "surface", "texture")
 READ_ME = """\
 report/index.html              everything on one page: open this first
 export/materials.json          diffuse and specular reflectance (linear Rec. 709), roughness r (GGX with \
@@ -26,6 +26,7 @@ x right, y up, z toward the viewer
 export/meshes/*.ply            meshes in their own frames; align/poses.json: cam_from_object, OpenCV \
 (x right, y down, z forward), lengths as in the meshes
 render/resynthesis/*.exr       photographs rendered again, linear
+recipes/                       pictures that were asked for
 evaluate/metrics.json          errors, and how far to trust the result
 
 In Python: factorlib.load_result("<this folder>")
@@ -55,7 +56,7 @@ def write_pack(home: Path, out: Path, replace: bool = False) -> int:
         raise InputError(
             "the file exists already", file=out, key="OUT", cure="name another file, or add FORCE=1 to replace it"
         )
-    walks = (os.walk(home / stage) for stage in STAGES)  # stages may be links into the store
+    walks = (os.walk(home / stage, followlinks=True) for stage in STAGES)  # links into the store
     below = [sorted(Path(place) / name for place, _, names in walk for name in names) for walk in walks]
     files = [home / "dataset.txt", *chain.from_iterable(below)]
     entries = {f"{home.name}/{path.relative_to(home).as_posix()}": path for path in files}

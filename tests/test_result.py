@@ -107,6 +107,10 @@ def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(c
     (home / "report" / "index.html").write_text("<html>")
     shutil.move(home / "export", copy / "kept")
     (home / "export").symlink_to(copy / "kept")  # as the runner leaves them
+    (home / "recipes").mkdir(exist_ok=True)
+    (copy / "drawn").mkdir()
+    (copy / "drawn" / "front.png").write_text("a picture")
+    (home / "recipes" / "mine").symlink_to(copy / "drawn")
     counts = [write_pack(home, file) for file in files]
     assert files[0].read_bytes() == files[1].read_bytes() and counts[0] == counts[1] > 10
     shutil.unpack_archive(files[0], tmp_path / "far")
@@ -114,6 +118,7 @@ def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(c
     assert factorlib.load_result(tmp_path / "far" / "set").materials["red"] == result.materials["red"]
     assert (tmp_path / "far" / "set" / "READ_ME.txt").exists()
     assert (tmp_path / "far" / "set" / "report" / "index.html").exists()
+    assert (tmp_path / "far" / "set" / "recipes" / "mine" / "front.png").read_text() == "a picture"
 
 
 def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_path, monkeypatch):
