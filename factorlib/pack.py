@@ -13,7 +13,7 @@ from factorlib.errors import InputError
 from factorlib.wholefile import writing
 
 NEEDED = ("report", "export", "masks", "align")
-STAGES = (*NEEDED, "evaluate", "recipes", "render", "shapes", "solve", "surface", "texture")
+STAGES = (*NEEDED, "evaluate", "exchange", "recipes", "render", "shapes", "solve", "surface", "texture")
 READ_ME = """\
 report/index.html              everything on one page: open this first
 export/materials.json          diffuse and specular reflectance (linear Rec. 709), roughness r (GGX with \

@@ -50,6 +50,7 @@ from factorlib.render.photo_scene import (
 )
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
+from factorlib.results.exchange import with_exchange
 from factorlib.results.materials import SolvedMaterial
 from factorlib.stage import Inputs, silent
 from factorlib.wholefile import write_bytes
@@ -100,7 +101,7 @@ def load_result(folder: str | Path) -> Result:
             cure=did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one",
         )
     check_whole(result, STAGES)
-    stages = [stage for stage in (*STAGES, "shapes", "surface", "texture") if (result / stage).is_dir()]
+    stages = [stage for stage in (*STAGES, "shapes", "surface", "texture", "exchange") if (result / stage).is_dir()]
     folders = {stage: (result / stage).resolve() for stage in stages}
     file = result / "export" / "dataset.json"
     source = folders["export"] / "source"
@@ -110,7 +111,7 @@ def load_result(folder: str | Path) -> Result:
             "the result has no facts of its data set", file=file, cure=f"make export DATASET={result.name}"
         )
     files = {path.relative_to(source).as_posix(): path for path in sorted(source.rglob("*")) if path.is_file()}
-    return Result(result, SolvedSet(Inputs(folders, facts, files)))
+    return Result(result, SolvedSet(with_exchange(Inputs(folders, facts, files))))
 
 
 class UnknownName(InputError, KeyError):

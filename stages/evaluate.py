@@ -36,6 +36,7 @@ from factorlib.evaluate.truth import (
 from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
+from factorlib.results.exchange import with_exchange
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
 from factorlib.results.metrics import AlbedoErrors, Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
 from factorlib.results.photos import read_photos
@@ -63,6 +64,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare results with the photos and the truth, and write metrics.json."""
+    inputs = with_exchange(inputs)
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
     materials = inputs.facts["dataset.materials"]

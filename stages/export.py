@@ -45,6 +45,7 @@ from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG
+from factorlib.results.exchange import with_exchange
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, Reflectance, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
@@ -71,6 +72,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write materials, lights, coverage and scenes in the formats of other programs."""
+    inputs = with_exchange(inputs)
     names = inputs.facts["dataset.materials"]
     slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])

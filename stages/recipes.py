@@ -9,6 +9,7 @@ from factorlib.meshes.read_mesh import CREASE_DEG
 from factorlib.recipe.kinds import recipe_of
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
+from factorlib.results.exchange import with_exchange
 from factorlib.stage import Inputs, Progress
 
 
@@ -21,4 +22,4 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Render the pictures of one recipe."""
-    draw(recipe_of(inputs.facts["recipe"]), SolvedSet(inputs, params.crease_deg), out, progress)
+    draw(recipe_of(inputs.facts["recipe"]), SolvedSet(with_exchange(inputs), params.crease_deg), out, progress)

@@ -19,6 +19,7 @@ from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import apply_tone
 from factorlib.reflection import reflection_operator
 from factorlib.render.resynthesis import Reflector, observed_cells, read_shading, render_balls
+from factorlib.results.exchange import with_exchange
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import read_materials, select_materials
 from factorlib.stage import Inputs, Progress
@@ -41,7 +42,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Render the re-synthesis of a photo, and balls and reflectance maps of every material in its light."""
-    name = inputs.photo
+    inputs, name = with_exchange(inputs), inputs.photo
     assert name is not None  # a stage over one photo
     names = inputs.facts["dataset.materials"]
     file = inputs["export"] / "materials.json"

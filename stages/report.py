@@ -16,6 +16,7 @@ from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
 from factorlib.report.pictures import exposures, first_pictures, material_tags, photo_row, strip, surface_rows
 from factorlib.report.viewer import viewer_data
+from factorlib.results.exchange import with_exchange
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
 
@@ -26,6 +27,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write the page and its figures."""
+    inputs = with_exchange(inputs)
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
     metrics = run.metrics
     assert metrics is not None  # `evaluate` is an input of this stage

@@ -104,7 +104,8 @@ class DatasetState:
         Only stages with parameters are imported, each in a process, because that takes seconds.
         """
         pending = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
-        codes = [self.code(name) for name in pending if self.spec.pipeline.stages[name].values]
+        stages = self.spec.pipeline.stages
+        codes = [self.code(name) for name in pending if stages[name].values and not stages[name].params_of]
         if not codes:
             return []
         from factorlib.runner.worker import Workers, check_params  # A run with nothing to do does not load it.

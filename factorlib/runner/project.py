@@ -285,6 +285,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
              one of the inputs, and the key has the files' contents, not their location
     shipped: result that ships with the source, copied if it was made by the same modules and parameters
     presets: parameters by the name of a preset, which the setting `<stage>.preset=<name>` stands for
+    params_of: stages whose parameters it takes, each under that stage's name
     """
 
     inputs: list[str] = []
@@ -300,6 +301,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shipped: Shipping | None = None
     params: dict[str, Any] = {}
     presets: dict[str, dict[str, Any]] = {}
+    params_of: list[str] = []
 
     @property
     def slices(self) -> list[str]:
@@ -383,6 +385,8 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
             refuse(f"there is no stage or slice {entry!r}", f"stages.{name}.inputs", did_you_mean(entry, known))
         if stage.when is not None and stage.when not in known_slices:
             refuse(f"there is no slice {stage.when!r}", f"stages.{name}.when", did_you_mean(stage.when, known_slices))
+        for other in (other for other in stage.params_of if other not in pipeline.stages):
+            refuse(f"there is no stage {other!r}", f"stages.{name}.params_of", did_you_mean(other, pipeline.stages))
     try:
         pipeline.order()
     except CycleError as error:
@@ -433,6 +437,9 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
             table = table[name]
         table[names[-1]] = _value(text, key)
         stages[stage] = msgspec.structs.replace(stages[stage], params=params)
+    for name, each in stages.items():
+        shared = {of: stages[of].values for of in each.params_of}
+        stages[name] = msgspec.structs.replace(each, params=each.params | shared)
     return msgspec.structs.replace(pipeline, stages=stages, executor=executor)
 
 

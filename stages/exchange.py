@@ -1,0 +1,110 @@
+"""Exchange of paint and light: the solve and the textures once more, each with what the other found.
+
+`texture` estimates paint in lights that were estimated without it, so lights and specular parts explain some of the
+paint.  Where a texture is kept, the problem is solved again with the textures as detail of the surface, the photos are
+shaded in these lights, and the textures are estimated again.  The exchange is kept if the textures then predict photos
+better that they were not estimated from.
+
+Writes exchange.json.  If the exchange is kept, the folders `solve`, `shading` and `texture` are new results of these
+stages, which replace theirs (`factorlib.results.exchange`).
+"""
+
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+
+from factorlib.dataset.schema import LightSlice
+from factorlib.images.exr import write_exr
+from factorlib.jsonfile import write_json
+from factorlib.results.exchange import FILE, Exchange
+from factorlib.results.surface_table import BEGINNING
+from factorlib.results.surface_table import FILE as SURFACE
+from factorlib.results.texture_table import TextureTable, read_table
+from factorlib.stage import Inputs, Progress, silent
+from factorlib.urm.extract import read_geometry
+from stages import shading, solve, texture
+
+SHARES = (0.6, 0.75)  # shares of the time at which the solve and the shading end
+USED = ("normal.", "detail.")  # prefixes of the channels of a surface that the solve reads
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Parameters of the stages that run again; pipeline.yaml takes them from these stages (`params_of`)."""
+
+    solve: solve.Params = solve.Params()
+    """Parameters of the solve."""
+    shading: shading.Params = shading.Params()
+    """Parameters of the shading."""
+    texture: texture.Params = texture.Params()
+    """Parameters of the textures."""
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Solve, shade and paint again where a texture is kept, and keep the result if it predicts better."""
+    before = read_table(inputs["texture"])
+    if not before.longest or params.solve.solver == "paper":  # the paper's materials are uniform
+        write_json(out / FILE, Exchange(False))
+        return
+    for name in ("solve", "shading", "texture"):
+        (out / name).mkdir()
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    first, second = SHARES
+    with TemporaryDirectory() as folder:
+        painted = paint_surface(inputs, Path(folder), list(lights))
+        solve.main(params.solve, with_folders(inputs, surface=painted), out / "solve", part_of(progress, 0, first))
+    solved = with_folders(inputs, solve=out / "solve")
+
+    def shade(name: str) -> None:
+        """Write the shading of a photo."""
+        facts = {**inputs.facts, "dataset.light": msgspec.to_builtins(lights[name])}
+        one = msgspec.structs.replace(solved, photo=name, facts=facts)
+        shading.main(params.shading, one, out / "shading", silent)
+        progress(first, 1, f"{name}: shading")
+
+    inputs.map(shade, list(lights))
+    shaded = with_folders(solved, shading=out / "shading")
+    texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1))
+    losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
+    kept = losses[1] < losses[0]
+    if not kept:
+        for name in ("solve", "shading", "texture"):
+            shutil.rmtree(out / name)
+    write_json(out / FILE, Exchange(kept, *losses))
+
+
+def paint_surface(inputs: Inputs, folder: Path, photos: list[str]) -> Path:
+    """Write a result of `surface` into a folder, with the textures as its detail; return the folder."""
+    surface = inputs.folders.get("surface")
+    (folder / "photos").mkdir()
+    for file in (SURFACE, BEGINNING):
+        if surface is not None and (surface / file).is_file():
+            shutil.copy(surface / file, folder / file)
+    for name in photos:
+        channels = read_geometry(inputs["align"], surface, name, inputs["texture"])
+        used = {channel: values for channel, values in channels.items() if channel.startswith(USED)}
+        write_exr(folder / "photos" / f"{name}.exr", used)
+    return folder
+
+
+def held_out_loss(table: TextureTable, kept: TextureTable) -> float:
+    """Return the mean loss of held-out photos under the textures of a table, over those that `kept` keeps."""
+    keys = {(each.mesh, each.material) for each in kept.textures if each.kept}
+    losses = [each.by.held_out_loss_with for each in table.textures if (each.mesh, each.material) in keys]
+    return sum(loss or 0.0 for loss in losses) / len(keys)
+
+
+def with_folders(inputs: Inputs, **folders: Path) -> Inputs:
+    """Return the inputs with other folders of some stages."""
+    return msgspec.structs.replace(inputs, folders={**inputs.folders, **folders})
+
+
+def part_of(progress: Progress, begin: float, end: float) -> Progress:
+    """Return a callback that reports its progress as that between two shares of the whole."""
+
+    def report(done: float, total: float, text: str = "") -> None:
+        """Report a part's progress."""
+        progress(begin + (end - begin) * done / max(total, 1e-9), 1, text)
+
+    return report
