@@ -15,6 +15,9 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 
+import stages.shading
+import stages.solve
+import stages.texture
 from factorlib.dataset.schema import LightSlice
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
@@ -24,7 +27,6 @@ from factorlib.results.surface_table import FILE as SURFACE
 from factorlib.results.texture_table import TextureTable, read_table
 from factorlib.stage import Inputs, Progress, silent
 from factorlib.urm.extract import read_geometry
-from stages import shading, solve, texture
 
 SHARES = (0.6, 0.75)  # shares of the time at which the solve and the shading end
 USED = ("normal.", "detail.")  # prefixes of the channels of a surface that the solve reads
@@ -33,11 +35,11 @@ USED = ("normal.", "detail.")  # prefixes of the channels of a surface that the 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parameters of the stages that run again; pipeline.yaml takes them from these stages (`params_of`)."""
 
-    solve: solve.Params = solve.Params()
+    solve: stages.solve.Params = stages.solve.Params()
     """Parameters of the solve."""
-    shading: shading.Params = shading.Params()
+    shading: stages.shading.Params = stages.shading.Params()
     """Parameters of the shading."""
-    texture: texture.Params = texture.Params()
+    texture: stages.texture.Params = stages.texture.Params()
     """Parameters of the textures."""
 
 
@@ -53,19 +55,21 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     first, second = SHARES
     with TemporaryDirectory() as folder:
         painted = paint_surface(inputs, Path(folder), list(lights))
-        solve.main(params.solve, with_folders(inputs, surface=painted), out / "solve", part_of(progress, 0, first))
+        stages.solve.main(
+            params.solve, with_folders(inputs, surface=painted), out / "solve", part_of(progress, 0, first)
+        )
     solved = with_folders(inputs, solve=out / "solve")
 
     def shade(name: str) -> None:
         """Write the shading of a photo."""
         facts = {**inputs.facts, "dataset.light": msgspec.to_builtins(lights[name])}
         one = msgspec.structs.replace(solved, photo=name, facts=facts)
-        shading.main(params.shading, one, out / "shading", silent)
+        stages.shading.main(params.shading, one, out / "shading", silent)
         progress(first, 1, f"{name}: shading")
 
     inputs.map(shade, list(lights))
     shaded = with_folders(solved, shading=out / "shading")
-    texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1))
+    stages.texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1))
     losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
     kept = losses[1] < losses[0]
     if not kept:

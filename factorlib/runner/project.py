@@ -97,7 +97,9 @@ def photo_sets() -> Provider:
         @cache
         def validation() -> Any:
             """Return the validation of the dataset; its module is loaded by name, as stages are, for it is science."""
-            return importlib.import_module("factorlib.validation").Validation(dataset)
+            module = importlib.import_module("factorlib.validation")
+            restore_sigterm()
+            return module.Validation(dataset)
 
         return Data(
             dataset.folder,
