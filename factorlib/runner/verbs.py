@@ -208,7 +208,10 @@ def show_params(project: Project, stages: list[str] | None) -> int:
 
     pipeline = pipeline_of(project)
     pipeline.check(stages or [])
-    for name in stages or (name for name in pipeline.order() if not pipeline.stages[name].params_of):
+    for name in stages or pipeline.order():
+        if others := pipeline.stages[name].params_of:
+            print(f"{name} takes the parameters of {', '.join(others)}")
+            continue
         params = load_stage(StageCode(project.code_root, project.package, name, {}, project.pipeline_file)).Params
         for param, values, default, text in parameters(params) or [("", "none", "", "It has no parameters.")]:
             print(f"{name}.{param} = {default}    ({values})" if param else name)

@@ -217,6 +217,14 @@ def test_sigterm_ends_a_run_as_an_interrupt_does(fresh):
     assert not list((fresh.build / "store" / "tmp").iterdir())
 
 
+def test_sigterm_prints_no_stack_after_files_were_validated():
+    """pycolmap, which validation imports, has a handler of its own."""
+    code = "import os, pathlib, signal; from factorlib.runner.project import photo_sets; "
+    code += "photo_sets().read(pathlib.Path('data/eames'), ()).cautions(); os.kill(os.getpid(), signal.SIGTERM)"
+    process = subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, capture_output=True, text=True)
+    assert process.returncode == -signal.SIGTERM and not process.stderr
+
+
 # ── two runs, inputs, clocks, places ─────────────────────────────────────────────────────────────────────────────────
 
 
