@@ -411,6 +411,9 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
     >>> pipeline = Pipeline(1, {"solve": Stage(presets={"fast": {"lobes": 8, "steps": 2}})})
     >>> with_settings(pipeline, ["solve.preset=fast solve.steps=3"]).stages["solve"].params
     {'lobes': 8, 'steps': 3}
+    >>> pipeline = Pipeline(1, {"solve": Stage(), "again": Stage(params_of=["solve"])})
+    >>> with_settings(pipeline, ["solve.lobes=64"]).stages["again"].params
+    {'solve': {'lobes': 64}}
     """
     stages = dict(pipeline.stages)
     executor = pipeline.executor
