@@ -435,8 +435,8 @@ def parameters(params: type) -> list[tuple[str, str, str, str]]:
                 match statement, following:
                     case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(text)):
                         texts[name] = " ".join(str(text).split())
-    schemas = msgspec.json.schema_components([params])[1]
-    for name, schema in schemas[params.__name__]["properties"].items():
+    (root,), schemas = msgspec.json.schema_components([params])
+    for name, schema in schemas[root["$ref"].rpartition("/")[2]]["properties"].items():
         if "$ref" in schema:
             inner = next(field.type for field in msgspec.structs.fields(params) if field.name == name)
             table += [(f"{name}.{each}", *rest) for each, *rest in parameters(inner)]  # type: ignore[misc]
