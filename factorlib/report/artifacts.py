@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.reading import check_plain
+from factorlib.results.exchange import Exchange, read_exchange
 from factorlib.results.materials import Channels as Factors
 from factorlib.results.materials import MaterialTable, SolvedMaterial, read_exposures, read_materials
 from factorlib.results.metrics import Metrics, read_metrics
@@ -20,7 +21,20 @@ from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface_table import SurfaceTable, read_surface
 from factorlib.results.texture_table import TextureTable, read_table
 
-STAGES = ["masks", "align", "urm", "surface", "train", "solve", "shading", "texture", "export", "render", "evaluate"]
+STAGES = [
+    "masks",
+    "align",
+    "urm",
+    "surface",
+    "train",
+    "solve",
+    "shading",
+    "texture",
+    "exchange",
+    "export",
+    "render",
+    "evaluate",
+]
 
 T = TypeVar("T")
 Channels = dict[str, Float[np.ndarray, "h w"]]
@@ -89,6 +103,11 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
     def texture(self) -> TextureTable:
         """Albedo textures from `texture`; none if there is no such result."""
         return read_table(self.folders.get("texture"))
+
+    @cached_property
+    def exchange(self) -> Exchange:
+        """Decision on the exchange of paint and light."""
+        return read_exchange(self.folders.get("exchange"))
 
     @cached_property
     def solved(self) -> MaterialTable:

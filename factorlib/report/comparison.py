@@ -14,6 +14,7 @@ from factorlib.pack import check_whole
 from factorlib.report.artifacts import STAGES, Artifacts, Picture
 from factorlib.report.pictures import downsample
 from factorlib.report.template import DASH, headlines, number, percent, render_template
+from factorlib.results.exchange import exchanged_folders
 from factorlib.results.materials import MaterialTable, SolvedMaterial, read_materials
 from factorlib.results.photos import read_photos
 
@@ -67,7 +68,7 @@ def _read_run(folder: Path) -> Artifacts:
     """Return the results of a run; InputError if it did not reach `export`."""
     check_whole(folder, (PHOTOS, MATERIALS))
     photo_set = SimpleNamespace(name=folder.name, photos=list(read_photos(folder / PHOTOS)))
-    return Artifacts({stage: folder / stage for stage in STAGES}, photo_set)
+    return Artifacts(exchanged_folders({stage: folder / stage for stage in STAGES}), photo_set)
 
 
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:

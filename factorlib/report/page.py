@@ -78,6 +78,7 @@ def page(
         maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
         surface=run.surface,
         texture=run.texture,
+        exchange=run.exchange,
         surfaces=surfaces,
         training=_training(run),
         cost=stage_costs(run.events(), STAGES),

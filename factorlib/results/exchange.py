@@ -1,7 +1,11 @@
 """Result of the stage `exchange`, and the results that it replaces where it is kept."""
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import msgspec
 
+from factorlib.jsonfile import read_result
 from factorlib.stage import Inputs
 
 FILE = "exchange.json"
@@ -24,6 +28,17 @@ class Exchange(msgspec.Struct, frozen=True):
 
 def with_exchange(inputs: Inputs) -> Inputs:
     """Return the inputs with the results of `solve`, `shading` and `texture` that the exchange replaced."""
-    folder = inputs.folders.get("exchange")
+    return msgspec.structs.replace(inputs, folders=exchanged_folders(inputs.folders))
+
+
+def exchanged_folders(folders: Mapping[str, Path]) -> dict[str, Path]:
+    """Return folders of stages, with those of the exchange in place of the results that it replaced."""
+    folder = folders.get("exchange")
     replaced = {name: folder / name for name in REPLACED if folder is not None and (folder / name).is_dir()}
-    return msgspec.structs.replace(inputs, folders={**inputs.folders, **replaced})
+    return {**folders, **replaced}
+
+
+def read_exchange(folder: Path | None) -> Exchange:
+    """Read the decision in a result folder of `exchange`; without one nothing was tried.  InputError if it is none."""
+    missing = folder is None or not (folder / FILE).exists()
+    return Exchange(False) if missing or folder is None else read_result(folder / FILE, Exchange, "exchange")
