@@ -17,9 +17,12 @@ from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
 from factorlib.report.comparison import comparison
 from factorlib.report.pictures import downsample
+from factorlib.results.exchange import Exchange
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.results.photos import PhotoFacts
+from factorlib.results.surface_table import DetailEvidence
+from factorlib.results.texture_table import TextureEvidence, TextureTable
 from factorlib.runner import verbs
 from factorlib.runner.project import Project, Provider
 from factorlib.stage import Inputs
@@ -181,6 +184,21 @@ def test_odd_sets_give_a_whole_page(odd, tmp_path):
         path.unlink()
     (inputs["train"] / "accuracy.json").unlink()
     parsed(page_of(inputs, tmp_path / "plain"))
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_paint_and_its_exchange_with_the_light_are_said(report_page, tmp_path, kept):
+    _, inputs, _ = report_page
+    by = DetailEvidence(held_out_loss_with=0.01, held_out_loss_without=0.03, margin=4.0)
+    for name, content in {
+        "texture": TextureTable({}, [TextureEvidence("ball", "red", True, 2, by)]),
+        "exchange": Exchange(kept, 0.01, 0.005),
+    }.items():
+        (tmp_path / name).mkdir()
+        write_json(tmp_path / name / f"{name}.json", content)
+    folders = inputs.folders | {name: tmp_path / name for name in ("texture", "exchange")}
+    page = page_of(msgspec.structs.replace(inputs, folders=folders), tmp_path / "report")
+    assert "red on ball" in page and ("Materials and lights were then solved again" in page) == kept
 
 
 def test_a_doubtful_pose_says_why_and_what_to_do(report_page, tmp_path):
