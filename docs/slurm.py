@@ -36,6 +36,8 @@ def slurm_cluster(**more: object) -> SLURMCluster:
 
 def main() -> int:
     """Ask for the jobs, run, and give them back."""
+    if not sys.argv[1:]:
+        sys.exit("give a data set, and settings after it: docs/slurm.py eames solve.cells=800")
     dataset, *settings = sys.argv[1:]
     with slurm_cluster() as cluster:
         cluster.scale(jobs=JOBS)
