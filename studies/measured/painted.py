@@ -1,7 +1,7 @@
 """Scores of painted sets, and what textures regain: `make results ONLY=painted LIGHTS="FOLDER …"`.
 
-The sets are five of `studies.measured.eames_like`, without and with paint: grain on wood, and a print or a patina on two
-of the shells.  Every set runs through the pipeline once.
+The sets are five of `studies.measured.eames_like`, without and with paint: grain on wood, and a print or a patina on
+two of the shells.  Every set runs through the pipeline once.
 """
 
 import os
