@@ -1,7 +1,7 @@
 """Scores of painted sets, and what textures regain: `make results ONLY=painted LIGHTS="FOLDER …"`.
 
-The sets are five of `studies.measured.eames_like`, without and with paint: grain on wood, and a print or a patina on
-two of the shells.  Every set runs through the pipeline once.
+The sets are six of `studies.measured.eames_like`, without and with paint: grain on wood, and a print or a patina on two
+of the shells.  Every set runs through the pipeline once.
 """
 
 import os
@@ -12,7 +12,7 @@ import numpy as np
 from studies.measured.eames_like import CAPTURED_SEEDS, SEEDS, SetResult, generate_set, run_captured, run_pipeline
 from studies.measured.tools import Tables
 
-MADE, CAPTURED = 3, 2  # numbers of sets in made and in captured lights
+COUNT = 3  # of the made sets, and as many of the captured ones
 SCORE = "relit_set.mean_psnr_db"
 ALBEDO = "albedo.overall.{}.median"
 
@@ -20,8 +20,8 @@ ALBEDO = "albedo.overall.{}.median"
 def rows() -> Tables:
     """Return a row for each set: scores without and with paint, and the error of albedo over all pixels."""
     folders = [Path(word) for word in os.environ.get("LIGHTS", "").split()]
-    pairs = [[run_made(seed, painted) for painted in (False, True)] for seed in SEEDS[:MADE]]
-    captured = CAPTURED_SEEDS[:CAPTURED] if folders else ()
+    pairs = [[run_made(seed, painted) for painted in (False, True)] for seed in SEEDS[:COUNT]]
+    captured = CAPTURED_SEEDS[:COUNT] if folders else ()
     pairs += [[run_captured(seed, folders, painted) for painted in (False, True)] for seed in captured]
     return {"Painted sets": rows_of(pairs)}
 
