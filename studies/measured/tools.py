@@ -16,16 +16,21 @@ from factorlib.results.metrics import read_metrics
 from factorlib.wholefile import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
+SOURCES = ("factorlib", "stages", "studies", "data", "pipeline.yaml")  # what numbers depend on
 Tables = dict[str, list[list[str]]]  # title -> rows of cells, the head first
 
 
 def machine() -> str:
     """Return the version, commit, date and kind of machine of this run."""
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
+    commit, changed = (
+        subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+        for words in (["rev-parse", "--short=8", "HEAD"], ["status", "--porcelain", *SOURCES])
+    )
+    commit = (commit or "unknown") + (" with changes" if changed else "")
     facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     model = next((line.partition(":")[2].strip() for line in facts.splitlines() if line.startswith("model name")), "?")
-    return f"Version {version}, commit {git.stdout.strip() or 'unknown'}, {date.today()}, {os.cpu_count()} × {model}"
+    return f"Version {version}, commit {commit}, {date.today()}, {os.cpu_count()} × {model}"
 
 
 def format_number(value: float, digits: int = 2) -> str:
