@@ -21,7 +21,7 @@ import stages.texture
 from factorlib.dataset.schema import LightSlice
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
-from factorlib.results.exchange import FILE, Exchange
+from factorlib.results.exchange import FILE, REPLACED, Exchange
 from factorlib.results.surface_table import BEGINNING
 from factorlib.results.surface_table import FILE as SURFACE
 from factorlib.results.texture_table import TextureTable, read_table
@@ -49,7 +49,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if not before.longest or params.solve.solver == "paper":  # the paper's materials are uniform
         write_json(out / FILE, Exchange(False))
         return
-    for name in ("solve", "shading", "texture"):
+    for name in REPLACED:
         (out / name).mkdir()
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     first, second = SHARES
@@ -73,7 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
     kept = losses[1] < losses[0]
     if not kept:
-        for name in ("solve", "shading", "texture"):
+        for name in REPLACED:
             shutil.rmtree(out / name)
     write_json(out / FILE, Exchange(kept, *losses))
 

@@ -63,25 +63,24 @@ def write_glb(
         variants: the mesh with other labels and detail of the same faces, by variant name (KHR_materials_variants)
     """
     # one primitive per combination of the faces' own label and their labels in each variant
-    choices, choice = np.unique([each.face_label for each in (mesh, *variants.values())], axis=1, return_inverse=True)
+    versions = [mesh, *variants.values()]
+    choices, choice = np.unique([each.face_label for each in versions], axis=1, return_inverse=True)
+    split = [msgspec.structs.replace(each, face_label=choice.reshape(-1) + 1) for each in versions]
     scene = trimesh.Scene()
     parts: dict[str, list[dict[str, Any]]] = {}
     images: list[str] = []
     for label, selected in enumerate(choices.T, start=1):
-        whole = [
-            msgspec.structs.replace(each, face_label=choice.reshape(-1) + 1) for each in (mesh, *variants.values())
-        ]
-        versions = [submesh(each, label) for each in whole]
-        if any(each.detail is not None for each in versions):
-            versions = [unwrap(each) for each in versions]
+        alike = [submesh(each, label) for each in split]
+        if any(each.detail is not None for each in alike):
+            alike = [unwrap(each) for each in alike]
         chosen = [names[k - 1] for k in selected]
         name = chosen[0] if chosen[0] not in parts else f"{chosen[0]} {label}"
-        part = versions[0]
+        part = alike[0]
         visual = TextureVisuals(part.uv, PBRMaterial(name=name))
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
         parts[name] = [
-            _entry(each, materials[each], version, images) for each, version in zip(chosen, versions, strict=True)
+            _entry(each, materials[each], painted, images) for each, painted in zip(chosen, alike, strict=True)
         ]
     exact = partial(_set_materials, parts=parts, variants=list(variants), images=images)
     write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))

@@ -40,5 +40,6 @@ def exchanged_folders(folders: Mapping[str, Path]) -> dict[str, Path]:
 
 def read_exchange(folder: Path | None) -> Exchange:
     """Read the decision in a result folder of `exchange`; without one nothing was tried.  InputError if it is none."""
-    missing = folder is None or not (folder / FILE).exists()
-    return Exchange(False) if missing or folder is None else read_result(folder / FILE, Exchange, "exchange")
+    if folder is None or not (folder / FILE).exists():
+        return Exchange(False)
+    return read_result(folder / FILE, Exchange, "exchange")

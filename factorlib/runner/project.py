@@ -429,6 +429,9 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
             raise InputError(f"{one_line(word)!r} is not a setting", key="SET", cure=cure)
         if stage not in stages:
             raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
+        if others := stages[stage].params_of:
+            cure = f"set it of one of these: {others[0]}.{'.'.join(names)}=…"
+            raise InputError(f"the stage {stage} has the parameters of {', '.join(others)}", key=key, cure=cure)
         table = params = dict(stages[stage].params)
         if names == ["preset"]:
             if text not in (presets := stages[stage].presets):

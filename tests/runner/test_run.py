@@ -15,10 +15,12 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import display, verbs
 from factorlib.runner.plan import PlannedStep, Step
+from factorlib.runner.project import Pipeline, Stage, with_settings
 from factorlib.runner.results_folder import clean, collect
 from factorlib.runner.run_folder import begin_run, end_run
 from factorlib.runner.store import Store, is_locked, lock
 from tests.faults.test_kills import start, wait_until
+from tests.refusal import refusal
 from tests.runner import toy
 from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
 
@@ -122,6 +124,11 @@ def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(proje
             assert verb(project, verbs.Request("set", settings=[setting])) == 1
             output = capsys.readouterr().err
             assert output.startswith(f"error: SET {setting}: ") and words in output and "nothing was run" in output
+
+
+def test_a_parameter_of_a_stage_that_takes_those_of_others_is_set_there():
+    pipeline = Pipeline(1, {"solve": Stage(), "again": Stage(params_of=["solve"])})
+    refusal("set it of one of these: solve.cells=", with_settings, pipeline, ["again.cells=8"])
 
 
 @pytest.mark.parametrize("param, value", [("times", "0"), ("times", "two"), ("sleep", "[1]")])
