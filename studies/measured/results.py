@@ -20,6 +20,7 @@ PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
     "reference": "data/synthetic",
     "eames_like": "data/eames, and sets made alike",
+    "speed": "Speed against error",
     "painted": "Painted sets",
     "operator": "Reflection operators",
     "align": "Poses",

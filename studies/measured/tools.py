@@ -11,8 +11,10 @@ from typing import Any
 
 import msgspec
 
+from factorlib.__main__ import project
 from factorlib.errors import InputError
 from factorlib.results.metrics import read_metrics
+from factorlib.runner.dataset_state import Request, read_state
 from factorlib.wholefile import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -117,3 +119,15 @@ def evaluate_dataset(dataset: Path | str, root: Path = ROOT, **variables: str) -
     """Return a data set's metrics, as `make evaluate` of the project below `root` makes them."""
     run_verb("evaluate", dataset, root, **variables)
     return msgspec.to_builtins(read_metrics(root / "build" / Path(dataset).name / "evaluate/metrics.json"))
+
+
+def processor_seconds(
+    dataset: Path | str, settings: Sequence[str] = (), held_out: Sequence[str] = ()
+) -> dict[str, float]:
+    """Return the processor seconds of each stage that `evaluate_dataset` needs, as its stored results took."""
+    state = read_state(project(), Request(str(dataset), ["evaluate"], settings, held_out=held_out), look=True)
+    seconds: dict[str, float] = {}
+    for planned in state.plan():
+        cost = state.store.entry(planned.key).cost
+        seconds[planned.step.stage] = seconds.get(planned.step.stage, 0.0) + cost["cpu_seconds"]
+    return seconds

@@ -2,7 +2,9 @@
 
 from importlib.util import find_spec
 from pathlib import Path
+from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 import pytest
 import yaml
@@ -13,7 +15,8 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import read_mesh
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
-from studies.measured import gallery, results, verdict
+from factorlib.results.metrics import Counts, Metrics, ResynthesisErrors
+from studies.measured import gallery, real_sets, results, speed, verdict
 from studies.measured.degradations import degrade
 from studies.measured.eames_like import MAPS, SetResult, link_maps, split_maps
 from studies.measured.standard_errors import light_deviations, material_deviations
@@ -35,6 +38,26 @@ def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
     )
     with pytest.raises(InputError, match="no place for the table 'other'"):
         replace_sections(page, {"other": ""})
+
+
+def test_speed_is_drawn_inside_the_figure_with_every_point_numbered():
+    points = [(20.0, 20.3), (130.0, 29.8), (85.0, 29.7)]
+    figure = ElementTree.fromstring(speed.draw(points, {2}))
+    circles = [element.attrib for element in figure.iter() if element.tag.endswith("circle")]
+    x, y = ([float(circle[name]) for circle in circles] for name in ("cx", "cy"))
+    assert np.argsort(x).tolist() == [0, 2, 1] and np.argsort(y).tolist() == [1, 2, 0]  # y points down
+    assert min(x) >= 0 and max(x) <= speed.WIDTH and min(y) >= 0 and max(y) <= speed.HEIGHT
+    assert [circle["fill"] == "#b22" for circle in circles] == [False, True, False]
+
+
+def test_a_real_set_has_no_number_where_nothing_was_measured():
+    counts = Counts(photos=2, materials=1, illuminations=2, components=1)
+    nothing = ResynthesisErrors({}, None, None, None)
+    empty = Metrics(counts, nothing, None, None, None, None, None, {})
+    assert real_sets.row_of("set", empty, 2.4) == ["set", "0", "–", "–", "0", "–", "–", "2"]
+    views = {name: {"predicted": dB, "nearest_photo": 20.0, "flat": 18.0} for name, dB in (("a", 24.0), ("b", 26.0))}
+    cells = real_sets.row_of("set", msgspec.structs.replace(empty, views=views), 2.4)
+    assert cells[4:6] == ["2", "25.0 (20.0; 18.0)"]
 
 
 def test_the_gallery_shows_every_recipe():
