@@ -172,15 +172,17 @@ WITHOUT: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
     "bounce": ("no bounce", "bounces", "", {"interreflection": "off"}),
     "tone": ("no tone curve", "tone curves", "", {"tone": "off"}),
+    "distance": ("lights at infinity", "distances of lights", "", {"distance": "off"}),
     "normals": ("all normals sure", "confidences of normals", "sure", {}),
     "clipped-as-data": ("clipped as data", "bounds for clipped values", "unclipped", {}),
     "clipped-left-out": ("clipped left out", "clipped pixels, as bounds,", "dropped", {}),
+    "splitting": ("with splitting of cells", "", "", {"splittings": 3}),
 }
 PARTS_QUICK = ("as-it-is", "bounce", "clipped-left-out")
 
 
 def parts_settings(scale: Scale) -> list[Setting]:
-    """Return the setting of the whole model, then one without each part."""
+    """Return the setting of the model without splitting, then one without each part, then one with splitting."""
     cases = {
         n: {"change": WITHOUT[n][2], "solve": scale.solve | WITHOUT[n][3]}
         for n in (PARTS_QUICK if scale.quick else WITHOUT)
@@ -209,7 +211,11 @@ PARTS = Study(
         project_claim(m, "as-it-is", n, f"{WITHOUT[n][1]} {does}")
         for m, does in {"diffuse": "make k_d truer", "glossy": "make lights truer"}.items()
         for n in WITHOUT
-        if n != "as-it-is"
+        if n not in ("as-it-is", "splitting")
+    )
+    + (
+        project_claim("diffuse", "splitting", "as-it-is", "splitting of cells makes k_d truer"),
+        project_claim("glossy", "splitting", "as-it-is", "splitting of cells makes lights truer"),
     ),
     steps=("rendered_sets", "parts"),
     sets=parts_sets,
