@@ -37,10 +37,10 @@ lock: .venv/ready
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache && $(PY) -m ruff format --check --no-cache --quiet
 	@.venv/bin/lint-imports --no-cache && $(PY) -m mypy
-	@OMP_NUM_THREADS=1 env -u DATASET -u SET -u HELD_OUT -u FORCE $(PY) -m pytest -n 2 -p no:cacheprovider
+	@OMP_NUM_THREADS=1 env -u DATASET -u SET -u HELD_OUT -u FORCE $(PY) -m pytest -n 2 --dist worksteal -p no:cacheprovider
 
 test-long: .venv/ready
-	@OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
+	@OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist worksteal -p no:cacheprovider -m long
 
 docs: .venv/ready
 	@test -x .venv/bin/mkdocs || EXTRAS=docs $(PY) -I factorlib/setup.py extras

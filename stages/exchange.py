@@ -9,7 +9,12 @@ Writes exchange.json.  If the exchange is kept, the folders `solve`, `shading` a
 stages, which replace theirs (`factorlib.results.exchange`).
 """
 
+import logging
 import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from logging.handlers import MemoryHandler
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -29,6 +34,7 @@ from factorlib.stage import Inputs, Progress, silent
 from factorlib.urm.extract import read_geometry
 
 SHARES = (0.6, 0.75)  # shares of the time at which the solve and the shading end
+LIBRARY = logging.getLogger("factorlib")
 USED = ("normal.", "detail.")  # prefixes of the channels of a surface that the solve reads
 
 
@@ -49,6 +55,32 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if not before.longest or params.solve.solver == "paper":  # the paper's materials are uniform
         write_json(out / FILE, Exchange(False))
         return
+    with held_back() as warnings:
+        solve_again(params, inputs, out, progress)
+    losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
+    kept = losses[1] < losses[0]
+    for warning in warnings if kept else ():
+        LIBRARY.handle(warning)
+    if not kept:
+        for name in REPLACED:
+            shutil.rmtree(out / name)
+    write_json(out / FILE, Exchange(kept, *losses))
+
+
+@contextmanager
+def held_back() -> Iterator[list[logging.LogRecord]]:
+    """Collect the library's warnings instead of handling them: those of a rejected exchange are about no result."""
+    collector = MemoryHandler(sys.maxsize, flushLevel=sys.maxsize, flushOnClose=False)
+    handlers, propagate = LIBRARY.handlers, LIBRARY.propagate
+    LIBRARY.handlers, LIBRARY.propagate = [collector], False
+    try:
+        yield collector.buffer
+    finally:
+        LIBRARY.handlers, LIBRARY.propagate = handlers, propagate
+
+
+def solve_again(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Solve with the textures as detail of the surface, shade in the new lights, and estimate the textures again."""
     for name in REPLACED:
         (out / name).mkdir()
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
@@ -70,12 +102,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     inputs.map(shade, list(lights))
     shaded = with_folders(solved, shading=out / "shading")
     stages.texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1))
-    losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
-    kept = losses[1] < losses[0]
-    if not kept:
-        for name in REPLACED:
-            shutil.rmtree(out / name)
-    write_json(out / FILE, Exchange(kept, *losses))
 
 
 def paint_surface(inputs: Inputs, folder: Path, photos: list[str]) -> Path:

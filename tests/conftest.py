@@ -12,6 +12,11 @@ settings.register_profile("untimed", deadline=None, suppress_health_check=[Healt
 settings.load_profile("untimed")  # a busy machine fails no test
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the run of the pipeline, which takes longest, so that no worker waits for it at the end."""
+    items.sort(key=lambda item: "small_run" not in item.name)
+
+
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory):
     """The toy, everything made; nobody changes it."""

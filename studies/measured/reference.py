@@ -39,7 +39,7 @@ ROUNDING = 1e-5
 FOLDER = ROOT / "tests" / "studies" / "regression"
 COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
 SMALL = (
-    *("masks.pixels=2500", "surface.observations=400", "solve.cells=120", "solve.observations=500"),
+    *("masks.pixels=1500", "surface.observations=250", "solve.cells=100", "solve.observations=300"),
     *("solve.splittings=1", "export.height=64", "export.mitsuba_height=32"),
 )
 # dotted path in metrics.json -> lowest, highest, meaning; a quarter beyond the worst of five trained networks × two

@@ -142,6 +142,7 @@ def test_a_worse_sign_never_raises_what_is_expected():
         assert (np.diff([verdict(of).expected_relit_db for of in signs]) < 0).all(), name
 
 
+@pytest.mark.long
 def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size_change():
     errors = StandardErrors((0.01, 0.004, 0.004), (0.004,) * 3, 0.01)
     (result,) = ball_changes({"red": attach_errors(TRUE["red"], errors)}, {"day": LIGHT}).values()

@@ -144,6 +144,7 @@ def test_ctrl_c_ends_it_and_names_what_is_not_saved(folder):
     assert refused.returncode == 1 and "PORT: port 70000 cannot be used" in refused.stderr
 
 
+@pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason=WHY)
 def test_in_a_browser_by_mouse_and_keys(folder):
     truth, box, mask = scene()[0], scene()[2], folder / "masks/day.png"

@@ -167,6 +167,7 @@ FURNACE = """() => {
 }"""
 
 
+@pytest.mark.long
 @needs_chromium
 def test_what_is_hidden_sends_what_it_gets(report_page, tmp_path):
     """In a sky of radiance 1 white is 1 everywhere, mirrored or not; the middle of the floor loses half of the light to a black disc, and two

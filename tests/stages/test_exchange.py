@@ -1,5 +1,6 @@
 """The stage `exchange`: it solves with the paint, and is kept only if held-out photos are predicted better."""
 
+import logging
 import shutil
 
 import msgspec
@@ -46,6 +47,7 @@ def exchanged(monkeypatch, tmp_path, inputs: Inputs, solution) -> Inputs:
 
     def solve(params, given, out, progress):
         """Copy the solution; the surface that it is given has the paint."""
+        logging.getLogger("factorlib.inference").warning("of this solution")
         for name in TURNS:
             surface, paint = (read_exr(given[s] / "photos" / f"{name}.exr") for s in ("surface", "texture"))
             normal = read_exr(given["align"] / f"{name}.exr")["normal.x"]
@@ -59,7 +61,7 @@ def exchanged(monkeypatch, tmp_path, inputs: Inputs, solution) -> Inputs:
     return with_exchange(msgspec.structs.replace(inputs, folders=inputs.folders | {"exchange": tmp_path}))
 
 
-def test_lights_that_explain_the_paint_better_replace_all_three_results(monkeypatch, tmp_path, painted):
+def test_lights_that_explain_the_paint_better_replace_all_three_results(monkeypatch, tmp_path, painted, caplog):
     inputs, true = painted
     after = exchanged(monkeypatch, tmp_path, inputs, true)
     decision = read_result(tmp_path / FILE, Exchange, "exchange")
@@ -68,14 +70,16 @@ def test_lights_that_explain_the_paint_better_replace_all_three_results(monkeypa
     assert (after["solve"] / "lobes.parquet").read_bytes() == (true / "lobes.parquet").read_bytes()
     pictures = [read_exr(each["shading"] / "b.exr")["diffuse.G"] for each in (inputs, after)]
     assert not np.allclose(*pictures)
+    assert caplog.messages.count("of this solution") == 1
 
 
-def test_where_nothing_is_predicted_better_all_stays(monkeypatch, tmp_path, painted):
+def test_where_nothing_is_predicted_better_all_stays(monkeypatch, tmp_path, painted, caplog):
     inputs, _ = painted
     after = exchanged(monkeypatch, tmp_path, inputs, inputs["solve"])
     assert not read_result(tmp_path / FILE, Exchange, "exchange").kept
     assert [path.name for path in tmp_path.iterdir()] == [FILE]
     assert after.folders == inputs.folders | {"exchange": tmp_path}
+    assert not caplog.messages
 
 
 @pytest.mark.parametrize("kept, solver", [(False, "joint"), (True, "paper")])

@@ -4,6 +4,7 @@ import json
 
 import msgspec
 import numpy as np
+import pytest
 
 from factorlib.dataset.schema import MeshEntry
 from factorlib.export.gltf_writer import write_glb
@@ -94,6 +95,7 @@ def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["surface.json"]
 
 
+@pytest.mark.long
 def test_a_held_out_photo_takes_no_part_whatever_it_shows(tmp_path):
     inputs = make_artifacts(Made(tmp_path, {"day": ["red"], "noon": ["red"], "dusk": ["red"]}, held_out=("dusk",)))
     dusk = read_observations(inputs["urm"] / "dusk.parquet")
