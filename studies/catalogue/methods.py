@@ -171,10 +171,8 @@ WITHOUT: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "as-it-is": ("as it is", "", "", {}),
     "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
     "bounce": ("no bounce", "bounces", "", {"interreflection": "off"}),
-    "tone": ("no tone curve", "tone curves", "", {"tone": "off"}),
     "distance": ("lights at infinity", "distances of lights", "", {"distance": "off"}),
     "normals": ("all normals sure", "confidences of normals", "sure", {}),
-    "clipped-as-data": ("clipped as data", "bounds for clipped values", "unclipped", {}),
     "clipped-left-out": ("clipped left out", "clipped pixels, as bounds,", "dropped", {}),
     "splitting": ("with splitting of cells", "", "", {"splittings": 3}),
 }

@@ -22,7 +22,6 @@ GAUGE = "channel_per_photo"  # of lights: what no photo tells is taken out
 CHANGES = {  # of the observations
     "": lambda o: o,
     "sure": lambda o: msgspec.structs.replace(o, confidence=None, weight=np.ones(len(o), o.weight.dtype)),
-    "unclipped": lambda o: msgspec.structs.replace(o, clipped=np.zeros_like(o.clipped)),
     "dropped": lambda o: o.take(~o.clipped.any(axis=1)),
 }
 
