@@ -11,7 +11,7 @@ from factorlib.inference.background import Background
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "inverse_sigma", "material", "photo", "held_out"),
-    *("visibility", "bounced", "confidence", "place", "row", "detail"),  # optional columns
+    *("visibility", "bounced", "confidence", "place", "row", "detail", "given_normal"),  # optional columns
 )
 CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
 
@@ -98,6 +98,7 @@ class Block(msgspec.Struct, frozen=True):
         background: Surroundings that the photos show; None if they are not used.
         ground: Patches of the ground, whose radiance is relative to what it would be without shadows; None without.
         detail: Factor on the diffuse reflectance of each observation's material, per channel; None for 1.
+        given_normal: Normals of the mesh as given, where `normal` is another (`Observations.cell_normal`).
     """
 
     name: str
@@ -121,9 +122,15 @@ class Block(msgspec.Struct, frozen=True):
     background: Background | None = None
     ground: Block | None = None
     detail: Float[np.ndarray, "n 3"] | None = None
+    given_normal: Float[np.ndarray, "n 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
+
+    @property
+    def cell_normal(self) -> Float[np.ndarray, "n 3"]:
+        """Normals of the mesh as given, which clusters are made of, like all cells (`Observations.cell_normal`)."""
+        return self.normal if self.given_normal is None else self.given_normal
 
     def take(self, rows: np.ndarray | slice) -> Block:
         """Return the observations `rows` (indices or a mask) alone."""
@@ -175,7 +182,9 @@ class Block(msgspec.Struct, frozen=True):
         The block must have no detail yet.
         """
         bounced = None if self.bounced is None else self.bounced * np.hstack([detail, np.ones_like(detail)])
-        return msgspec.structs.replace(self, normal=normal, detail=detail, bounced=bounced)
+        return msgspec.structs.replace(
+            self, normal=normal, detail=detail, bounced=bounced, given_normal=self.cell_normal
+        )
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the whitened residuals of a predicted `radiance`, which is in the block's unit.
@@ -190,4 +199,4 @@ class Block(msgspec.Struct, frozen=True):
 
         The observations of a cluster mirror one region of the light, so that their residuals are correlated.
         """
-        return np.unique(mirror_cells(self.normal, self.view, CLUSTER), return_inverse=True)[1].reshape(-1)
+        return np.unique(mirror_cells(self.cell_normal, self.view, CLUSTER), return_inverse=True)[1].reshape(-1)

@@ -178,15 +178,16 @@ def _block(
     observations = observations.take(order)
     local = local[order]
     turned = {photo: np.asarray(rotation, dtype=float) for photo, rotation in rotations.items() if rotation is not None}
-    normal, view = (
-        _rotate_units(vectors, observations, turned) for vectors in (observations.normal, observations.view)
+    normal, given_normal, view = (
+        _rotate_units(vectors, observations, turned)
+        for vectors in (observations.normal, observations.cell_normal, observations.view)
     )
     radiance = observations.radiance.astype(float)
     # radiance in units of the weighted mean
     unit = max(float(np.average(radiance.mean(1), weights=observations.weight)), 1e-30)
     scaled = radiance / unit
     # whole cells of mirror directions are held out
-    held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), observations.material, share, seed)
+    held_out = held_out_by_cells(mirror_cells(given_normal, view, HELD_OUT_CELL), observations.material, share, seed)
     visibility = directions = None
     if observations.visibility is not None and (observations.visibility < 255).any():
         sphere = fibonacci_sphere(observations.visibility.shape[1])
@@ -200,6 +201,7 @@ def _block(
         bounced if bounced is not None and bounced.any() else None, noise,
         None if observations.confidence is None else observations.confidence.astype(float),
         None if observations.place is None else _rotate(observations.place, observations, turned), rows[order],
+        given_normal=None if observations.given_normal is None else given_normal,
     )  # fmt: skip
     if observations.detail is None or (observations.detail == 1).all():
         return block

@@ -151,7 +151,7 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
     detail = np.stack([maps[f"detail.{channel}"][observations.y, observations.x] for channel in "RGB"], axis=-1)
     detail = np.where(known, detail, 1.0).astype(np.float32)
     normal = np.where(known, normal, observations.normal).astype(np.float32)
-    return msgspec.structs.replace(observations, normal=normal, detail=detail)
+    return msgspec.structs.replace(observations, normal=normal, detail=detail, given_normal=observations.cell_normal)
 
 
 def _photo_maps(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:

@@ -64,6 +64,7 @@ class Observations(msgspec.Struct, frozen=True):
     confidence    confidence of the normal, 0 to 1
     place         position as in `factorlib.light.distance`
     detail        factor on the diffuse reflectance
+    given_normal  normal of the mesh as given, where `normal` is another; cells are made of it (`cell_normal`)
     """
 
     normal: Float[np.ndarray, "n 3"]
@@ -85,6 +86,7 @@ class Observations(msgspec.Struct, frozen=True):
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
     detail: Float[np.ndarray, "n 3"] | None = None  # factor on diffuse reflectance, never written; None: 1
+    given_normal: Float[np.ndarray, "n 3"] | None = None  # never written; None: `normal` is that of the mesh
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -94,9 +96,18 @@ class Observations(msgspec.Struct, frozen=True):
         """Half vector of the paper, (2(n·o)n − o + (0, 0, −1)) / 2, camera frame, from normals and views as float32."""
         return half_of_normal_and_view(self.normal.astype("f4").astype("f8"), self.view.astype("f4").astype("f8"))
 
+    @property
+    def cell_normal(self) -> Float[np.ndarray, "n 3"]:
+        """Normal of the mesh as given.
+
+        Cells of directions are made of it, because the last bits of an estimated normal must not decide which
+        observations are merged, drawn or held out.
+        """
+        return self.normal if self.given_normal is None else self.given_normal
+
     def take(self, rows: np.ndarray) -> Observations:
         """Select the observations of `rows` (indices or a mask), with the same names."""
-        columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL, "detail")}
+        columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL, "detail", "given_normal")}
         selected = {name: values[rows] for name, values in columns.items() if values is not None}
         return msgspec.structs.replace(self, **selected)
 
@@ -209,6 +220,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     if any(part.materials != materials for part in parts):
         raise InputError("the observations of the photos have different lists of materials", cure=cure)
     fields: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+    if any(part.given_normal is not None for part in parts):
+        fields["given_normal"] = np.concatenate([part.cell_normal for part in parts])
     # renumber photos and illuminations over the sorted union of names
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
         fields[kind] = tuple(sorted({name for part in parts for name in getattr(part, kind)}))

@@ -38,9 +38,9 @@ def merge(observations: Observations, degrees: float) -> Observations:
     if degrees <= 0 or len(observations) == 0:
         return observations
     cell = np.radians(degrees)
-    mirror = mirror_directions(observations.normal, observations.view)
+    mirror = mirror_directions(observations.cell_normal, observations.view)
     flags = observations.clipped @ np.array([1, 2, 4])
-    cells = [direction_cells(observations.normal, cell), direction_cells(mirror, 2 * cell)]
+    cells = [direction_cells(observations.cell_normal, cell), direction_cells(mirror, 2 * cell)]
     if observations.detail is not None:
         cells.append(np.rint(np.log(np.maximum(observations.detail, 1e-3)) / DETAIL_CELL).astype(np.int64))
     if (visibility := observations.visibility) is not None:  # mean of hidden × direction
@@ -54,7 +54,7 @@ def merge(observations: Observations, degrees: float) -> Observations:
     total = np.bincount(group, weight)
 
     changed = {"weight": total.astype("f4")}
-    for name in ("normal", "view", "radiance", "place", "detail"):
+    for name in ("normal", "view", "radiance", "place", "detail", "given_normal"):
         if (values := getattr(observations, name)) is None:
             continue
         mean = np.column_stack([np.bincount(group, weight * v) / total for v in values.T])

@@ -9,6 +9,7 @@ import pytest
 from factorlib.dataset.schema import MeshEntry
 from factorlib.export.gltf_writer import write_glb
 from factorlib.generate.solids import sphere
+from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import write_exr
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, gather_observations
@@ -43,6 +44,11 @@ def written(folder) -> None:
     channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {f"detail.{c}": detail for c in "RGB"}
     (folder / "photos").mkdir(parents=True)
     write_exr(folder / "photos" / "a.exr", channels)
+
+
+def detail_names() -> list[str]:
+    """Channels of the detail of the reflectance."""
+    return [f"detail.{channel}" for channel in "RGB"]
 
 
 def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tmp_path):
@@ -87,6 +93,32 @@ def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(
     assert np.array_equal(np.sort(block.detail, 0), np.sort(photo.merged.detail, 0))
     plain = msgspec.structs.replace(photo.merged, detail=None)
     assert blocks_of_observations(plain, Noise())[0].detail is None
+
+
+def test_the_last_digits_of_estimated_normals_decide_nothing(tmp_path):
+    """Observations that are merged, held out and drawn are the same on processors that round otherwise."""
+    normals, inside = ball_normals(48)
+    y, x = (of.astype("i4") for of in np.nonzero(inside))
+    radiance = np.full((len(x), 3), 0.5, "f4")
+    normals[:, 1:] *= -1  # to the camera's frame
+    pixels = observations_from_front(normals.astype("f4"), radiance, 0 * x, ("red",), "a", x=x, y=y)
+    write_observations(tmp_path / "a.parquet", pixels)
+    samples = []
+    for number in range(2):
+        turned = normals + [0.1, 0, 0] + np.random.default_rng(number).normal(0, 1e-3, normals.shape)
+        maps = {name: np.zeros(inside.shape) for name in ("normal.x", "normal.y", "normal.z", *detail_names())}
+        for axis, values in zip("xyz", (turned / np.linalg.norm(turned, axis=1, keepdims=True)).T, strict=True):
+            maps[f"normal.{axis}"][inside] = values
+        (folder := tmp_path / str(number) / "photos").mkdir(parents=True)
+        write_exr(folder / "a.exr", maps | dict.fromkeys(detail_names(), inside.astype(float)))
+        (photo,) = gather_observations([tmp_path / "a.parquet"], 8.0, serial_map, folder.parent)
+        (block,) = blocks_of_observations(photo.merged, Noise())
+        samples.append(block.subsample(200, seed=0))
+    first, second = samples
+    assert len(first) < len(block) < len(pixels)  # some are merged, and some of these are drawn
+    for name in ("row", "held_out", "inverse_sigma", "view"):
+        assert np.array_equal(getattr(first, name), getattr(second, name)), name
+    assert 0 < np.abs(first.normal - second.normal).max() < 0.01
 
 
 def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
