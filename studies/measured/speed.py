@@ -19,11 +19,9 @@ VARIANTS = {  # label -> SET
     "100 cells, 300 observations, no splitting": "solve.cells=100 solve.observations=300 solve.splittings=0",
     "150 cells, no splitting": "solve.cells=150 solve.splittings=0",
     "fast: 150 cells": "solve.preset=fast",
-    "250 cells": "solve.cells=250",
     "no splitting": "solve.splittings=0",
     "300 observations": "solve.observations=300",
     "4000 observations": "solve.observations=4000",
-    "800 cells": "solve.cells=800",
     "default: 400 cells, 1000 observations, 3 splittings": "",
 }
 HEAD = ["solve", "processor seconds of `solve`", "relit set score, dB", "worst pair, dB", "error of roughness"]
