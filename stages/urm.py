@@ -71,7 +71,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     meshes = read_meshes(inputs, poses.objects)
     ground = ground_plane(inputs, meshes, poses.objects)
     background = surrounding_radiance(photo, camera, surface_centre(geometry), ground)
-    (out / "background").mkdir()
+    (out / "background").mkdir(exist_ok=True)  # one folder for all photos, outside the runner
     write_rgb_exr(out / "background" / f"{name}.exr", background, LAT_LONG)
     # visibility: rays from observations past all meshes of the photo
     if params.directions and len(observations):
@@ -80,7 +80,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             view = GroundView(camera, ground, occluders)
             shadows = ground_observations(photo, geometry, view, observations, params.directions)
             if shadows is not None:
-                (out / "ground").mkdir()
+                (out / "ground").mkdir(exist_ok=True)
                 write_observations(out / "ground" / f"{name}.parquet", shadows)
         visibility = occluders.visibility_at(
             camera,

@@ -8,10 +8,11 @@ import pytest
 
 from factorlib.evaluate.ball import uniform_light
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.reflection.network import SHIPPED
 from factorlib.results.materials import MaterialTable, StandardErrors, attach_errors
 from factorlib.stage import Inputs, silent
 from studies.spheres import materials_of, observe_spheres
-from studies.steps import score, solve
+from studies.steps import Params, parts, rendered_sets, score, solve
 from studies.study import Case, Objects, World, full_matrix
 
 LIGHTS = {li: uniform_light(np.array([1.0, 0.8, 0.5]) * (1 + li)) for li in range(3)}
@@ -103,3 +104,20 @@ def test_the_truth_in_any_gauge_scores_nothing(case):
     assert (
         min(result.nulls[p] for p in ("entries", "new_light")) > 1e-3
     )  # of constant lights, as these, all else is right
+
+
+# ── rendered sets ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.long
+def test_a_rendered_set_is_observed_photo_by_photo_and_solved_without_a_part(tmp_path):
+    sets = {"seeds": [0], "shots": 2, "width": 120, "height": 90, "spp": 4, "light_rows": 16}
+    (out := tmp_path / "sets").mkdir()
+    rendered_sets.main(Params(), Inputs({}, {"dataset.sets": sets}), out, silent)
+    assert len(list((out / "0" / "urm").glob("*.parquet"))) == len(list((out / "0" / "urm/background").iterdir())) == 2
+    case = {"seed": 0, "change": "dropped", "solve": {"splittings": 0, "cells": 48, "interreflection": "off"}}
+    inputs = Inputs({"rendered_sets": out, "train": SHIPPED}, {"dataset.case": case}, photo="bounce")
+    (scores := tmp_path / "scores").mkdir()
+    parts.main(Params(), inputs, scores, silent)
+    for errors in json.loads((scores / "bounce.json").read_text("utf-8")).values():  # of the estimate, of the null
+        assert np.isfinite([errors[name] for name in ("diffuse", "specular", "roughness", "mirror", "glossy")]).all()
