@@ -75,7 +75,7 @@ RECORDS = """
 import json
 from factorlib.__main__ import project
 from factorlib.runner.dataset_state import Request, read_state
-records = read_state(project(), Request("data/synthetic")).records
+records = read_state(project(), Request("data/moved")).records
 print(*(f"{step} {json.dumps(record, sort_keys=True, default=str)}" for step, record in records.items()), sep="\\n")
 """
 
@@ -95,11 +95,11 @@ def test_an_installed_wheel_has_its_command_and_its_operator(installed, tmp_path
 
 def test_an_installed_command_away_from_a_checkout_has_the_same_pipeline_and_the_same_keys(installed, tmp_path):
     """What a result is known by does not depend on where the stages lie: the records of a plan are those of the checkout."""
-    shutil.copytree(ROOT / "data" / "synthetic", tmp_path / "data" / "synthetic")
+    shutil.copytree(ROOT / "data" / "synthetic", tmp_path / "data" / "moved")
     command = str(installed / "bin" / "factorlib")
-    process = run(installed, command, "validate", "-d", "synthetic", cwd=tmp_path)
+    process = run(installed, command, "validate", "-d", "moved", cwd=tmp_path)
     assert process.returncode == 0 and "are good" in process.stdout, process.stderr
-    process = run(installed, command, "plan", "-d", "synthetic", "--recipe", "insert", cwd=tmp_path)
+    process = run(installed, command, "plan", "-d", "moved", "--recipe", "insert", cwd=tmp_path)
     assert process.returncode == 0 and "recipes" in process.stdout, process.stderr
     assert (tmp_path / "build").is_dir() and not (installed / "build").exists()
     here, there = (run(site, "-c", RECORDS, cwd=tmp_path) for site in (installed, ROOT))
