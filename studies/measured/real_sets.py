@@ -8,10 +8,11 @@ far as anything must run: some minutes a set.
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
-from factorlib.results.metrics import Metrics, read_metrics
-from studies.measured.tools import ROOT, Tables, environment_words, processor_seconds, run_verb
+from factorlib.results.metrics import Metrics
+from studies.measured.tools import Tables, environment_words, evaluate_dataset, processor_seconds
 
 HEAD = [
     "set",
@@ -47,9 +48,8 @@ def measure(word: str) -> list[str]:
     """Return the row of a folder, with the photos to hold out after a colon."""
     folder, _, held_out = word.partition(":")
     path = Path(folder).resolve()
-    run_verb("evaluate", path, HELD_OUT=held_out)
+    metrics = msgspec.convert(evaluate_dataset(path, HELD_OUT=held_out), Metrics)
     seconds = processor_seconds(path, held_out=held_out.split(",") if held_out else ())
-    metrics = read_metrics(ROOT / "build" / path.name / "evaluate/metrics.json")
     return row_of(path.name, metrics, (sum(seconds.values()) - seconds["train"]) / 60)
 
 
