@@ -11,7 +11,7 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new photos label compare validate verify clean gc pack setup lock test test-long docs results study studies data help help-all $(STAGES)
+.PHONY: all plan why status graph logs params new photos label compare validate verify clean gc pack setup lock test check-types run-tests test-long docs results study studies data help help-all $(STAGES)
 
 # each reads DATASET, SET, HELD_OUT and FORCE from the environment
 all plan why status graph logs params new photos label compare validate verify pack $(STAGES): .venv/ready
@@ -36,7 +36,14 @@ lock: .venv/ready
 
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache && $(PY) -m ruff format --check --no-cache --quiet
-	@.venv/bin/lint-imports --no-cache && $(PY) -m mypy
+	@.venv/bin/lint-imports --no-cache
+	@$(MAKE) -j 2 check-types run-tests
+
+# beside the tests, since it takes one core
+check-types:
+	@$(PY) -m mypy
+
+run-tests:
 	@OMP_NUM_THREADS=1 env -u DATASET -u SET -u HELD_OUT -u FORCE $(PY) -m pytest -n 2 --dist worksteal -p no:cacheprovider
 
 test-long: .venv/ready

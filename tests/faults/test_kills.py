@@ -244,7 +244,10 @@ MEANWHILE = {  # what changes while a step runs -> that stage, the line before w
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", MEANWHILE)
+USUAL = ("a photo goes", "a result is spoilt", "the code is another")  # the others are variants of these
+
+
+@pytest.mark.parametrize("what", [pytest.param(what, marks=[LONG] * (what not in USUAL)) for what in MEANWHILE])
 def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made_once, capfd, what):
     """Nothing is kept under a key that says something else, and once it is as it was the run goes on."""
     stage, before, code, words = MEANWHILE[what]

@@ -46,7 +46,7 @@ def tried(irradiance: float, seed: int):
     return [one, *(problem.illuminations(around.point)[0] for around in fits)]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     cells, sun, wide = tried(0.5, seed)
     light, irradiance = sun.light, solved(0.5, seed)[1]
@@ -55,7 +55,7 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     np.testing.assert_allclose(light.energy[light.suns][0], irradiance, rtol=0.3)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
 def test_no_sun_is_found_in_a_sky_without_one(seed):
     cells, sun, wide = tried(0.0, seed)
     assert not (accept_sun(cells, sun).accepted and compare_illuminations(wide, sun, CLEARLY_AGAINST).accepted)

@@ -149,7 +149,7 @@ def browser(report_page):
 @needs_chromium
 @pytest.mark.parametrize(
     "material, view",
-    [("brass", {}), ("brass", {"azimuth": 0.7, "elevation": -0.4, "turn": 1.1}), ("white", {"turn": -2.0})],
+    [("brass", {"azimuth": 0.7, "elevation": -0.4, "turn": 1.1}), ("white", {"turn": -2.0})],
 )
 def test_it_shows_what_the_pipeline_renders(browser, material, view):
     """The glossiest material and the roughest; 2 % at the 95th percentile of pixels."""
@@ -201,7 +201,7 @@ def test_what_is_hidden_sends_what_it_gets(report_page, tmp_path):
 
 
 @needs_chromium
-@pytest.mark.parametrize("simplified", [False, True])
+@pytest.mark.parametrize("simplified", [pytest.param(False, marks=pytest.mark.long), True])
 def test_paint_is_shown_while_its_part_has_its_own_material(report_page, tmp_path, monkeypatch, simplified):
     """The left half of a ball has half of red's diffuse reflectance, the right half all of it."""
     monkeypatch.setattr(viewer, "MOST_TRIANGLES", 4000 if simplified else 10**6)

@@ -208,7 +208,8 @@ def busy(live, whose):
     return [pid for worker, of in computing.items() for pid in ([worker] if whose == "worker" else of) if of]
 
 
-@pytest.mark.parametrize("victim", ["worker", pytest.param("process", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("victim", ["worker", "process"])
 def test_a_worker_or_child_killed_in_mid_step_costs_that_step_alone_and_no_bit(project, live, tmp_path, victim):
     go, tries = waiting_for_a_file(project, tmp_path)
     process = start(project, *live.settings)
