@@ -19,6 +19,7 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -52,6 +53,16 @@ class ResultsFolder(msgspec.Struct, frozen=True):
             fault = f"does not list the current results ({getattr(error, 'strerror', None) or error})"
             cure = "delete it: the next run writes it again and finds the results in the store"
             raise InputError(fault, file=self.keys_file, cure=cure) from None
+
+    def failures(self) -> dict[str, str]:
+        """Return the error of each key that a step has failed with; damaged lines of the log are left out."""
+        errors = {}
+        for line in self.log.read_bytes().splitlines() if self.log.is_file() else []:
+            with contextlib.suppress(*DECODE_ERRORS, KeyError):
+                event = msgspec.json.decode(line, type=dict[str, Any])
+                if event["event"] == "failed":
+                    errors[event["key"]] = event["text"]
+        return errors
 
     def owner(self, project: Project) -> Path | None:
         """Return the folder of the dataset whose results these are; None if dataset.txt cannot be read."""

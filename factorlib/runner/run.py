@@ -106,7 +106,7 @@ class Run:
         self.display.plan(planned)
         for p in (p for p in planned if p.status == "to run" and p.step in self.completed - self.failed.keys()):
             error = f"{p.reasons[0]}, although it was made in this run: is the disk failing?"
-            self._fail(p.step, Outcome(error=error))
+            self._fail(p.step, p.key, Outcome(error=error))
 
     def _start(self, planned: PlannedStep) -> None:
         """Start a step if its cores and its lock are free."""
@@ -204,7 +204,7 @@ class Run:
             outcome = Outcome(error=str(error) if expected else f"{DIED} ({type(error).__name__})")
         work.lock.release()
         if outcome.error is not None:
-            return self._fail(step, outcome)
+            return self._fail(step, work.task.key, outcome)
         if self.store.get(work.task.key) not in (None, outcome.output):
             self.display.report(f"warning: {step}: the same inputs gave another result than before")
         self.store.forget([work.task.key])
@@ -213,10 +213,10 @@ class Run:
         if entry := self.store.entry(work.task.key):
             append_text(self.state.results.log, "".join(map(json_line, entry.events())))
 
-    def _fail(self, step: Step, outcome: Outcome) -> None:
+    def _fail(self, step: Step, key: str, outcome: Outcome) -> None:
         self.failed[step] = outcome
         self.display.fail(step, outcome.error or "", outcome.traceback)
-        event = {"event": "failed", "stage": step.stage, "photo": step.item or None, "text": outcome.error}
+        event = {"event": "failed", "stage": step.stage, "photo": step.item or None, "text": outcome.error, "key": key}
         append_text(self.state.results.log, json_line(event | {"traceback": outcome.traceback}))
 
 

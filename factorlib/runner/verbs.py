@@ -132,7 +132,7 @@ def show_plan(project: Project, request: Request, every_reason: bool = False) ->
 
 
 def show_status(project: Project, request: Request) -> int:
-    """Print the progress of each stage, and the warnings of current results."""
+    """Print the progress of each stage, the warnings of current results, and the errors of steps that failed."""
     state = read_state(project, request, look=True)
     planned = state.plan()
     counts: dict[str, Counter] = {}
@@ -144,6 +144,10 @@ def show_status(project: Project, request: Request) -> int:
     for p in planned:
         if entry := _result(state, p):
             print(*(f"warning: {p.step}: {text}\n" for text in entry.warnings), sep="", end="")
+    failures = state.results.failures()
+    for p in planned:
+        if p.status != "current" and p.key in failures:
+            print(f"error: {p.step}: {failures[p.key]}")
     return 0
 
 
