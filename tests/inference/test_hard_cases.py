@@ -323,7 +323,6 @@ def random_start(count: int, seed: int):
 @pytest.mark.long
 @pytest.mark.parametrize(("rows", "lights"), [(ONE, 1), (TWO, 2), (FIVE, 1)], ids=["1 × 1", "2 × 2", "5 × 1"])
 def test_ten_random_starts_end_at_one_roughness(rows, lights):
-    """Another tenth that is held out moves 5 × 1 by more (docs/hard-cases.md)."""
     scene, choices = observed(rows, rooms(0, lights), 0, NORMALS), msgspec.structs.replace(CHOICES, splittings=1)
     problem = JointProblem(blocks_of_observations(scene.observations, Noise()), OPERATOR)
     starts = [random_start(len(rows), seed) for seed in range(10)]
