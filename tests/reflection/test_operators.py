@@ -1,6 +1,7 @@
 """Laws that every operator obeys, errors of the fast ones against the reference, and the reference and the paper's spheres against integrals."""
 
 import os
+import platform
 import shutil
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from factorlib.conventions import FRONT
-from factorlib.reflection import reflection_operator
+from factorlib.reflection import fused, reflection_operator
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import FEATURES, SHIPPED, Layers, read_layers, write_layers
 from factorlib.reflection.operator import Operator
@@ -148,6 +149,22 @@ def test_compiled_response_is_that_of_torch(roughness):
         error = (a - b).abs() / scale
         assert error.quantile(0.99) < 1e-4, field
         assert error.max() < 1e-2, field
+
+
+@compiler
+@pytest.mark.long
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="names instructions of x86-64")
+@pytest.mark.parametrize("flags", ["-march=x86-64-v3", "-march=x86-64 -O1 -fno-tree-vectorize"])
+def test_no_instruction_set_or_optimisation_changes_a_bit_of_the_compiled_response(monkeypatch, tmp_path, flags):
+    point = grid(0.4, torch.float32, rows=331)
+    expected = reflection_operator("network").response(*point)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(fused, "FLAGS", fused.FLAGS.replace("-march=native", flags))
+    monkeypatch.setattr(fused, "compiled", fused.compiled.__wrapped__)
+    response = reflection_operator("network").response(*point)
+    assert len(list((tmp_path / "factorlib").iterdir())) == 2
+    for field in expected.__struct_fields__:
+        assert torch.equal(getattr(response, field), getattr(expected, field)), field
 
 
 def test_without_a_compiler_torch_computes_the_same(monkeypatch):
