@@ -204,7 +204,7 @@ class Conclusion(msgspec.Struct, frozen=True):
         agreeing = answers.count("agrees")
         if "disagrees" in answers or not 0 < agreeing < len(answers):
             return "disagrees" if "disagrees" in answers else answers[0]
-        return f"agrees in part: {agreeing} of {len(answers)} claims are shown"
+        return f"agrees in part: {agreeing} of {len(answers)} claims {'is' if agreeing == 1 else 'are'} shown"
 
 
 def conclude(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:

@@ -92,7 +92,7 @@ def test_an_answer_in_part_says_of_how_many_and_a_quick_study_concludes_nothing(
     given = scores(FULL, a=0.1, b=0.2)
     answers = [conclude(study(*of), FULL, given).answer for of in ((CLAIM, OTHER), (OTHER,), ())]
     nothing = "the paper claims nothing that is tested here"
-    assert answers == ["agrees in part: 1 of 2 claims are shown", "no difference is shown", nothing]
+    assert answers == ["agrees in part: 1 of 2 claims is shown", "no difference is shown", nothing]
     table = conclude(study(CLAIM), QUICK, scores(QUICK, a=0.1, b=0.9))
     assert "no conclusion" in paragraph(table) and table.answer.startswith("not tested") and not table.claims
 
