@@ -124,6 +124,7 @@ def test_the_same_seed_is_the_same_paint(office, tmp_path):
     assert files_of(again) == files_of(office[1])
 
 
+@pytest.mark.long
 def test_paint_changes_pictures_and_nothing_else(office):
     """A set without paint has the same mesh, masks, normals, poses and materials, and no albedo."""
     plain, painted = map(files_of, office)
@@ -137,6 +138,7 @@ def test_paint_changes_pictures_and_nothing_else(office):
     assert truth == msgspec.structs.replace(plain_truth, albedo={"office": "truth/office_albedo.exr"})
 
 
+@pytest.mark.long
 def test_a_photo_shows_the_paint(office):
     """The photo over that without paint has, in logarithms, the contrast of albedo over k_d, less what gloss adds."""
     plain, painted = (read_photo(each / "photos/office.jpg").radiance for each in office)

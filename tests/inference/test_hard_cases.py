@@ -242,7 +242,7 @@ BEYOND = (
     *("all Lambertian", "all mirror-like: roughness 0.1", "a light of one point", "normals with noise of 5°"),
     *("20 % of normals wrong by 40°", "a black material"),
 )
-QUICK = ("flat objects", "an object of 30 pixels", "a single pixel", "1 material × 1 light")
+QUICK = ("flat objects", "an object of 30 pixels", "a single pixel")
 
 
 def solved(scene: Scene, choices: SolveOptions) -> tuple[JointProblem, Solution, list[str]]:
