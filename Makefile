@@ -40,10 +40,10 @@ test: .venv/ready
 	@$(MAKE) -j 2 check-types run-tests
 
 # beside the tests, since it takes one core
-check-types:
+check-types: .venv/ready
 	@$(PY) -m mypy
 
-run-tests:
+run-tests: .venv/ready
 	@OMP_NUM_THREADS=1 env -u DATASET -u SET -u HELD_OUT -u FORCE $(PY) -m pytest -n 2 --dist worksteal -p no:cacheprovider
 
 test-long: .venv/ready

@@ -95,7 +95,7 @@ def test_turning_camera_objects_and_light_together_changes_nothing(pair):
     )
 
 
-def test_lobes_and_their_map_are_the_same_light_however_it_is_turned(pair):
+def test_turned_lobes_and_their_turned_map_are_the_same_light(pair):
     """The map's axes are the world's, the lobes' the camera's."""
     as_map = msgspec.structs.replace(pair, light=rotate_light(lat_long_of_lobes(pair.light, 64, 128), 70))
     as_lobes = msgspec.structs.replace(pair, light=rotate_light(pair.light, 70))
