@@ -9,14 +9,16 @@ import logging
 import os
 import signal
 import sys
+import tempfile
 import textwrap
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence, Sized
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import msgspec
 
@@ -280,6 +282,14 @@ def begin(
         raise InputError("no folder of photos is named", key="PHOTOS", cure=cure)
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
+    with ended_by_signals(folder):
+        return _begin(project, dataset, folder, photos, meshes, masks)
+
+
+def _begin(
+    project: Project, dataset: str, folder: Path, photos: Path, meshes: Path | None, masks: Path | MatteFile | None
+) -> int:
+    """Create a dataset in a folder, as `begin` does."""
     notes = []
     if isinstance(masks, MatteFile):
         with _shown("photos") as progress:  # modules by name: they are science
@@ -301,6 +311,34 @@ def begin(
     first = drawn if any("make label" in line for line in missing) else ""
     print(f"next: {first}{project.command('validate', dataset)}")
     return 0
+
+
+@contextlib.contextmanager
+def ended_by_signals(target: Path) -> Iterator[None]:
+    """End the process at SIGINT or SIGTERM, whatever handlers COLMAP has and however long its code runs.
+
+    A thread waits for these signals, which all others block. It replaces the process by a shell, which ends them all,
+    removes the temporary folders, and drafts of `target`, and exits as a shell does after the signal.
+    """
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
+
+    def end() -> NoReturn:
+        """Wait for a signal."""
+        number = signal.sigwait(numbers)
+        print("stopped", file=sys.stderr, flush=True)
+        drafts = map(str, target.parent.glob(f".{target.name}.*"))
+        remove = 'code=$1; shift; rm -rf -- "$@"; exit "$code"'
+        os.execvp("sh", ["sh", "-c", remove, "sh", str(128 + number), root, *drafts])
+
+    with tempfile.TemporaryDirectory() as root:
+        tempfile.tempdir = root
+        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+        threading.Thread(target=end, daemon=True).start()
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
+            tempfile.tempdir = None
 
 
 @contextlib.contextmanager

@@ -225,6 +225,21 @@ def test_sigterm_prints_no_stack_after_files_were_validated():
     assert process.returncode == -signal.SIGTERM and not process.stderr
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_make_photos_ends_at_a_signal_inside_native_code_and_removes_what_it_began(tmp_path, number):
+    code = "import ctypes, pathlib, tempfile; from factorlib.runner.verbs import ended_by_signals\n"
+    code += f"with ended_by_signals(pathlib.Path({str(tmp_path / 'mine')!r})):\n    import pycolmap; "
+    code += f"print(tempfile.mkdtemp(), tempfile.mkdtemp(dir={str(tmp_path)!r}, prefix='.mine.'), flush=True); "
+    code += "ctypes.CDLL(None).sleep(60)"
+    words = [sys.executable, "-c", code]
+    with subprocess.Popen(words, cwd=LIBRARY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        folders = process.stdout.readline().split()
+        assert all(map(os.path.isdir, folders)) and len(folders) == 2
+        process.send_signal(number)
+        assert process.wait(30) == 128 + number and process.stderr.read() == "stopped\n"
+    assert not any(map(os.path.exists, folders))
+
+
 # ── two runs, inputs, clocks, places ─────────────────────────────────────────────────────────────────────────────────
 
 
