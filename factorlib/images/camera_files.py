@@ -11,24 +11,21 @@ three channels of the result are clipped. The picture is cropped as the file spe
 programs show it.
 """
 
-import io
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Shaped
-from PIL import ImageCms
 from scipy.ndimage import maximum_filter
 
 from factorlib.dataset.schema import RAW
 from factorlib.errors import InputError
+from factorlib.images.colour_space import LINEAR, SRGB, UNSPECIFIED, VIDEO, colour_space
 from factorlib.images.exif import read_exif
 from factorlib.images.scanlines import CLIPPED, COPY, OpenPhoto
 
 BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"mif2"}
-VIDEO = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273 for HDR video
 SIZES = ("Exif:PixelXDimension", "Exif:PixelYDimension")
 FAILURES = (ValueError, EOFError, SyntaxError, RuntimeError, OSError)  # exceptions of pillow-heif for damaged files
 ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}  # EXIF's orientation for LibRaw's `flip`
@@ -64,11 +61,10 @@ def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
         raise refusal(f"not readable as HEIF ({error})", convert) from None
     info = picture.info
     width, height = picture.size
-    curve = VIDEO.get((info.get("nclx_profile") or {}).get("transfer_characteristics", 0))
-    if curve:
-        raise refusal(
-            f"is encoded for HDR video ({curve}), not as sRGB", "export it from the phone as a JPEG, or without HDR"
-        )
+    nclx = info.get("nclx_profile") or {}
+    points = [nclx.get(name, UNSPECIFIED) for name in ("color_primaries", "transfer_characteristics")]
+    profile = info.get("icc_profile")
+    stated = {"ICCProfile": profile} if profile and points[1] not in VIDEO else {"CICP": points}
 
     @cache
     def pixels() -> Shaped[np.ndarray, "h w 3"]:
@@ -87,9 +83,8 @@ def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
         width=width,
         height=height,
         exif=_upright_exif(info.get("exif"), width > height),
-        profile=_profile_name(info.get("icc_profile")),
         white=2 ** info["bit_depth"] - 1,
-        encoding="srgb",
+        space=colour_space(path, stated, SRGB, key),
         rows=lambda begin, end: pixels()[begin:end],
     )
 
@@ -101,14 +96,6 @@ def _upright_exif(block: bytes | None, is_wide: bool) -> dict[str, float | int]:
     if across and down and (across > down) != is_wide:
         exif |= dict(zip(SIZES, (down, across)))
     return exif
-
-
-def _profile_name(profile: bytes | None) -> str:
-    """Return the name of an ICC profile, "" for a damaged one or none."""
-    with suppress(OSError, ImageCms.PyCMSError):
-        if profile:
-            return ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile))).strip()
-    return ""
 
 
 def is_raw(path: str | Path) -> bool:
@@ -158,7 +145,7 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
         orientation=ORIENTATION.get(sizes.flip, 1),
         exif={**dict(zip(TAGS, camera)), **read_exif(path)},
         white=WHITE,
-        encoding="linear",
+        space=LINEAR,
         rows=lambda begin, end: develop()[0][begin:end],
         saturated=lambda begin, end: np.repeat(develop()[1][begin:end, :, None], 3, axis=2),
     )

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
+from PIL.ExifTags import IFD
 
-EXIF_IFD = 0x8769
 NAMES = {
     0x829A: "ExposureTime",
     0x829D: "FNumber",
@@ -40,13 +40,12 @@ UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # EXIF FocalPlaneResolutionUnit
 log = logging.getLogger("factorlib.images")
 
 
-def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
-    """Read the tags of a block in HEIF's form ("Exif", two zeros, a TIFF), or of a file that begins as a TIFF does.
+def load_tags(source: bytes | str | Path | None) -> Image.Exif:
+    """Load the tags of a block in HEIF's form ("Exif", two zeros, a TIFF), or of a file that begins as a TIFF does.
 
-    DNG and most raw files begin so. Missing or damaged tags are left out. `DNG` is True for a DNG.
+    DNG and most raw files begin so. The tags of other or damaged files are empty.
     """
     exif = Image.Exif()
-    values: dict[str, float | int] = {}
     with (
         suppress(*DAMAGED),
         warnings.catch_warnings(action="ignore"),  # Pillow warns of damaged tags
@@ -56,8 +55,17 @@ def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
             exif.load_from_fp(stream)
         elif isinstance(source, bytes | None):
             exif.load(source or b"")
+        exif.get_ifd(IFD.Interop)  # loads this directory and the one above it before the file is closed
+    return exif
+
+
+def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
+    """Read the numbers that `load_tags` loads. Missing or damaged ones are left out; `DNG` is True for a DNG."""
+    values: dict[str, float | int] = {}
+    with suppress(*DAMAGED), warnings.catch_warnings(action="ignore"):
+        exif = load_tags(source)
         values |= {"DNG": True} if DNG_VERSION in exif else {}
-        tags = exif.get_ifd(EXIF_IFD)
+        tags = exif.get_ifd(IFD.Exif)
         for tag in NAMES.keys() & tags.keys():
             try:
                 number = float(tags[tag][0] if isinstance(tags[tag], tuple) else tags[tag])

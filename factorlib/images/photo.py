@@ -1,11 +1,12 @@
 """Reader of photos: linear radiance, clipped channels, finite pixels, and EXIF data.
 
 Orientation   as displayed: the EXIF orientation is applied.
-Encoding      8- and 16-bit files are sRGB-encoded, float and raw files linear, unless `encoding` is given; primaries
-              are those of an EXR or HDR's header, else assumed to be Rec. 709.
+Colours       those of the file's profile; without one, integers are sRGB-encoded, float and raw files linear, and
+              primaries are Rec. 709's. `encoding` replaces the curve, not the primaries.
 Channels      one channel is grey; alpha is dropped.
-Clipped       integer codes from `scanlines.CLIPPED` of the range (254 of 255) on; for a raw file, saturated sensor
-              pixels. A float file has no top code; values that are not finite are invalid pixels.
+Clipped       integer codes from `scanlines.CLIPPED` of the range (254 of 255) on, and channels that the primaries mix
+              such a code into; for a raw file, saturated sensor pixels. A float file has no top code; values that are
+              not finite are invalid pixels.
 Size          a photo can be downsampled by a whole factor f while it is read, so that only some rows of it are in
               memory at a time: radiance by its linear mean; clipped if any part is; finite if any part is. Every pixel
               of the smaller picture is a box of f × f pixels. A whole factor is exact: each pixel belongs to one box,
@@ -14,7 +15,6 @@ Size          a photo can be downsampled by a whole factor f while it is read, s
               boxes are whole, and a point (x, y) of the photo is exactly (x/f, y/f) of the smaller picture.
 """
 
-import logging
 from collections.abc import Callable, Iterator
 from math import isqrt
 from pathlib import Path
@@ -25,13 +25,13 @@ from jaxtyping import Bool, Float, Shaped
 
 from factorlib.errors import InputError
 from factorlib.images.camera_files import is_heif, is_raw, open_heif, open_raw
+from factorlib.images.colour_space import ColourSpace
 from factorlib.images.exif import exif_exposure, exif_focal_px
 from factorlib.images.scanlines import OpenPhoto, open_scanlines
 from factorlib.images.tone import DECODERS
 from factorlib.reading import reading
 
 READ_AT_ONCE = 1 << 21  # number of pixels that are in memory as floats
-log = logging.getLogger("factorlib.images")
 VOTED_AT_ONCE = 1 << 21  # number of pixels of a strip
 
 
@@ -44,7 +44,7 @@ class Photo(msgspec.Struct, frozen=True):
     focal_px   focal length from EXIF, in pixels of `radiance` as displayed
     width      width of `radiance`
     height     height of `radiance`
-    encoding   encoding of the file, as given or implied
+    encoding   curve of the file, as given or stated: "srgb", "linear", "gamma2.2", or "profile" for others
     factor     a pixel of `radiance` stands for factor² pixels of the file
     exposure   t·S/N² from EXIF
     """
@@ -86,7 +86,7 @@ def read_photo(path: str | Path, encoding: str | None = None, key: str | None = 
 
     Args:
         path: File.
-        encoding: "srgb", "linear" or "gamma2.2"; None takes what the format implies.
+        encoding: "srgb", "linear" or "gamma2.2"; None takes what the file states.
         key: Key to name in errors.
 
     Returns:
@@ -130,27 +130,25 @@ def decode_photo(
 
     Args:
         opened: The open photo.
-        encoding: Encoding of its values; None takes what the format implies.
+        encoding: Encoding of its values; None takes what the file states.
         factor: Factor of the downsampling.
         path: File to name in warnings.
         look: Called with the linear values of the file, some rows at a time, before they are averaged.
     """
-    encoding = encoding or opened.encoding
+    space = opened.space
+    if encoding is not None:
+        space = ColourSpace((DECODERS[encoding],) * 3, space.to_rec709)
     height, width = (n // factor for n in (opened.height, opened.width))
     radiance = np.empty((height, width, 3), np.float32)
     clipped = np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(opened, factor, path):
-        linear = _linearise(codes, opened.white, encoding)
+        linear = space.linear(codes, opened.white)
         look(linear)
         numbers = np.logical_and.reduce(np.isfinite(linear), -1)
         linear[~numbers] = 0
         radiance[rows], finite[rows] = box_mean(linear, numbers, factor) if factor > 1 else (linear, numbers)
-        clipped[rows] = box_any(cut, factor)
-    profile = opened.profile
-    if profile and "srgb" not in profile.lower() and "709" not in profile:
-        advice = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
-        log.warning("%s: its colour profile is %r; %s", path, profile, advice)
+        clipped[rows] = box_any(space.clipped(cut), factor)
     radiance, clipped, finite = (_orient(pixels, opened.orientation) for pixels in (radiance, clipped, finite))
     focal_px = exif_focal_px(opened.exif, opened.width, opened.height, path)
     return Photo(
@@ -160,21 +158,10 @@ def decode_photo(
         focal_px and focal_px / factor,
         finite.shape[1],
         finite.shape[0],
-        encoding,
+        space.encoding,
         factor,
         exif_exposure(opened.exif),
     )
-
-
-def _linearise(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
-    """Decode codes to linear values: computed for floats and wide codes, looked up for codes of up to 16 bits."""
-    decode = DECODERS[encoding]
-    if white is None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.array(decode(codes.astype(np.float32)), dtype=np.float32)
-    if white >= 2**16:
-        return decode(codes / white).astype(np.float32)
-    return decode(np.arange(white + 1) / white).astype(np.float32)[codes]
 
 
 def _orient(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "i j *c"]:

@@ -5,9 +5,9 @@ rows are read in order, in chunks of any height. The size is checked before any 
 one colour takes a thousandth of its size in memory, so a file of a few megabytes can need all memory of a machine.
 
 For the formats of OpenImageIO (JPEG, PNG, TIFF, EXR, HDR), one channel is grey, and repeated; alpha is dropped. Integer
-colours are taken as opened, not premultiplied by alpha; float colours (EXR) are premultiplied by convention. Float
-colours of other primaries are converted to Rec. 709 without adaptation of white. An EXR has the size of its display
-window.
+colours are taken as opened, not premultiplied by alpha; float colours (EXR) are premultiplied by convention. White of
+float colours keeps its chromaticity. An EXR has the size of its display window. Of a JPEG with a gain map (Ultra HDR),
+the picture that other programs show is read; Pillow decodes it, since OpenImageIO would apply the map.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import logging
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -24,17 +25,21 @@ import msgspec
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Shaped
+from PIL import Image
 
 from factorlib.errors import InputError
+from factorlib.images.colour_space import LINEAR, SRGB, ColourSpace, colour_space, to_rec709
 from factorlib.reading import one_line, reading
 
 CLIPPED = 0.995  # least share of the white code that is clipped: JPEG compression disturbs the top code a little
 WHITE = {oiio.UINT8: 2**8 - 1, oiio.UINT16: 2**16 - 1, oiio.UINT32: 2**32 - 1}
-REC709 = np.array([[0.64, 0.33], [0.3, 0.6], [0.15, 0.06], [0.3127, 0.329]])  # red, green, blue, white: x, y
-SAME_CHROMATICITY = 1e-3  # primaries that differ by less are the same
-LARGEST_GAIN = 100.0  # greatest factor between primaries; damaged ones have more
+FLOATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+READ_COLOURS = ("", "RGB", "YCbCr", "palette")  # colours of TIFF and JPEG that are converted to RGB exactly
+BEAUTY = ("beauty", "rgba", "rgb", "combined", "main")  # names that renderers give to the layer that is the picture
+SAME_ASPECT = 0.01  # tolerance of a pixel's width over its height
 HEADER = 4096  # number of bytes that hold the header of a Radiance file
 COPY = "copy it again from its source"
+OLD_RUNS = "; if it has the run lengths of Radiance before 1991, convert it: ra_xyze -r in.hdr out.hdr"
 log = logging.getLogger("factorlib.images")
 MOST_MEGAPIXELS = 200.0  # twice the number of the largest sensors
 CHANNELS = 4  # greatest number of channels of an ordinary photo
@@ -47,9 +52,8 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
     width, height  size as stored
     orientation    EXIF's, of the stored pixels: 1 as displayed, 2 to 4 mirrored or rotated by 180°, 5 to 8 transposed
     exif           EXIF tags by OpenImageIO's names
-    profile        name of the colour profile, "" for none
     white          code of 1.0; None if the pixels are floats
-    encoding       encoding that the format implies
+    space          meaning of the codes
     rows           (begin, end) -> those rows, which are requested in order, each at most once
     saturated      (begin, end) -> mask of saturated values in those rows; None: values with codes near white
     """
@@ -58,9 +62,8 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
     height: int
     orientation: int = 1
     exif: dict[str, Any]
-    profile: str = ""
     white: int | None
-    encoding: str
+    space: ColourSpace
     rows: Rows
     saturated: Callable[[int, int], Bool[np.ndarray, "r w 3"]] | None = None
 
@@ -89,19 +92,23 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
     """Open a photo of a format that OpenImageIO reads; InputError if it is not an image of grey or RGB."""
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
+    with Path(path).open("rb") as stream:
+        head = stream.read(HEADER)
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
         fault = f"not readable as an image ({one_line(oiio.geterror())})"
-        raise InputError(
-            fault, file=path, key=key, cure="the file is damaged or has a wrong suffix: copy or export it again"
-        )
-    spec = source.spec()
-    colours = _colours(spec, path, key)
+        cure = "the file is damaged or has a wrong suffix: copy or export it again"
+        if b"FORMAT=32-bit_rle_xyze" in head:
+            fault = "is a Radiance picture of XYZE, which is not read"
+            cure = f"convert it to RGBE: ra_xyze -r {Path(path).name} out.hdr"
+        raise InputError(fault, file=path, key=key, cure=cure)
+    spec, colours = _picture(source, path, key)
+    _check_kind(spec, path, key)
     first = min(colours)
     last = max(colours) + 1
     picked = [c - min(colours) for c in colours]
 
-    def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
+    def stored_rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
         """Read rows begin … end − 1; from a tiled file, the rows of tiles that contain them are read."""
         if tall := spec.tile_height:
             top = begin // tall * tall
@@ -113,24 +120,116 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
             pixels = source.read_scanlines(spec.y + begin, spec.y + end, 0, first, last, spec.format)
         error = source.geterror()
         if pixels is None or "Premature end" in error:
-            raise InputError(f"truncated or damaged ({one_line(error)})", file=path, key=key, cure=COPY)
+            cure = COPY + OLD_RUNS if source.format_name() == "hdr" else COPY
+            raise InputError(f"truncated or damaged ({one_line(error)})", file=path, key=key, cure=cure)
         if error:
             log.warning("%s: %s", path, one_line(error))
         return pixels.reshape(-1, spec.width, last - first)[begin - top : end - top, :, picked]
 
     orientation = spec.get_int_attribute("Orientation", 1)
+    attributes = {a.name: a.value for a in spec.extra_attribs}
     white = WHITE.get(spec.format.basetype)
     size = (spec.height, spec.width) if white else (spec.full_height, spec.full_width)
+    rows: Rows = stored_rows
+    if source.format_name() in ("openexr", "hdr"):
+        rows = _in_display_window(rows, spec)
+        space = _scene_space(spec, head, path)
+    else:
+        if source.format_name() == "jpeg" and white is None:
+            rows = _base_rows(path)
+            white = 2**8 - 1
+        space = colour_space(path, attributes, SRGB if white else LINEAR, key)
     return OpenPhoto(
         width=size[1],
         height=size[0],
         orientation=orientation if 1 <= orientation <= 8 else 1,
-        exif={a.name: a.value for a in spec.extra_attribs},
-        profile=spec.get_string_attribute("ICCProfile:profile_description"),
+        exif=attributes,
         white=white,
-        encoding="linear" if white is None else "srgb",
-        rows=rows if white else _in_rec709(_in_display_window(rows, spec), spec, path),
+        space=space,
+        rows=rows,
     )
+
+
+def _picture(source: oiio.ImageInput, path: str | Path, key: str | None) -> tuple[oiio.ImageSpec, list[int]]:
+    """Open the part of a file that is the picture, and return its header and the indices of red, green and blue.
+
+    Parts (of an EXR, or pages of a TIFF) and layers (`layer.R`) that have colours are candidates; grey ones, if none
+    has. The unnamed layer of a file of one part is the picture, else the one with a name of BEAUTY, else the largest.
+    """
+    specs = [source.spec()]
+    while source.format_name() in ("openexr", "tiff") and source.seek_subimage(len(specs), 0):
+        specs.append(source.spec())
+    parts = [
+        (part, layer or spec.get_string_attribute("oiio:subimagename"), spec, colours)
+        for part, spec in enumerate(specs)
+        for layer, colours in _layers(spec).items()
+    ]
+    candidates = [each for each in parts if len(set(each[3])) == 3] or [each for each in parts if each[3]]
+    if not candidates:
+        raise InputError(
+            f"has the channels {', '.join(specs[0].channelnames)}: neither grey nor RGB",
+            file=path,
+            key=key,
+            cure="save it as RGB or grey, in one layer",
+        )
+    largest = max(spec.width * spec.height for _, _, spec, _ in candidates)
+    for choice in (
+        candidates,
+        [each for each in candidates if not each[1] and len(specs) == 1],
+        [each for each in candidates if each[1].rpartition(".")[2].lower() in BEAUTY],
+        [each for each in candidates if each[2].width * each[2].height == largest],
+    ):
+        if len(choice) == 1:
+            source.seek_subimage(choice[0][0], 0)
+            source.geterror()  # of the page after the last
+            return choice[0][2:]
+    names = ", ".join(name or f"page {part + 1}" for part, name, _, _ in candidates)
+    raise InputError(
+        f"has {len(candidates)} pictures, and which one is the photo is not clear: {names}",
+        file=path,
+        key=key,
+        cure="save that one as a file of its own, or call its layer 'beauty'",
+    )
+
+
+def _layers(spec: oiio.ImageSpec) -> dict[str, list[int]]:
+    """Return the indices of red, green and blue by layer, equal for a picture of one grey channel, [] for others."""
+    names = list(spec.channelnames)
+    layers = dict.fromkeys(name.rpartition(".")[0] for name in names if name.rpartition(".")[2] in ("R", "G", "B"))
+    found = {
+        layer: [names.index(name) for name in colours]
+        for layer in layers
+        if set(colours := [f"{layer}.{c}".lstrip(".") for c in "RGB"]) <= set(names)
+    }
+    grey = [index for index, name in enumerate(names) if index != spec.alpha_channel and name != "Z"]
+    return found or {"": 3 * grey if len(grey) == 1 else []}
+
+
+def _check_kind(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> None:
+    """Check that codes and pixels are of a kind that is read; InputError names another one."""
+    kind = spec.format.basetype
+    colours = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
+    aspect = spec.get_float_attribute("PixelAspectRatio", 1.0)
+    faults = {
+        "it has deep samples": spec.deep,
+        f"its codes are of type {spec.format}": kind not in WHITE and kind not in FLOATS,
+        f"its colours are {colours}": colours not in READ_COLOURS,
+        f"its pixels are not square, but of aspect {aspect:.3g}": abs(aspect - 1) > SAME_ASPECT,
+    }
+    if fault := next((fault for fault, is_true in faults.items() if is_true), None):
+        cure = "save it as RGB of 8 or 16 bits, flat, in square pixels"
+        raise InputError(f"not readable as a photo: {fault}", file=path, key=key, cure=cure)
+
+
+def _base_rows(path: str | Path) -> Rows:
+    """Return the reader of rows of a JPEG's picture without its gain map; the picture is decoded once, as a whole."""
+
+    @cache
+    def base() -> Shaped[np.ndarray, "h w 3"]:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+
+    return lambda begin, end: base()[begin:end]
 
 
 def _in_display_window(rows: Rows, spec: oiio.ImageSpec) -> Rows:
@@ -154,46 +253,12 @@ def _in_display_window(rows: Rows, spec: oiio.ImageSpec) -> Rows:
     return displayed
 
 
-def _in_rec709(rows: Rows, spec: oiio.ImageSpec, path: str | Path) -> Rows:
-    """Return the reader of rows in linear Rec. 709; colours beyond it have negative values.
-
-    Primaries are EXR's attribute `chromaticities`, Radiance's line PRIMARIES, or else Rec. 709's, as where all of them
-    are 0. They need not be colours: ACES' blue has a negative y.
-    """
-    with Path(path).open("rb") as stream:
-        line = re.match(rb"#\?[\S\s]*?\nPRIMARIES=([^\n]*)\n", stream.read(HEADER))
-    given = spec.getattribute("chromaticities") or (line[1].split() if line else REC709)
+def _scene_space(spec: oiio.ImageSpec, head: bytes, path: str | Path) -> ColourSpace:
+    """Return the linear space of EXR's attribute `chromaticities` or Radiance's line PRIMARIES, else of Rec. 709."""
+    line = re.match(rb"#\?[\S\s]*?\nPRIMARIES=([^\n]*)\n", head)
+    given = spec.getattribute("chromaticities") or (line[1].split() if line else [0.0] * 8)
     with reading("eight chromaticities of primaries", path, cure="write it again without them"):
-        primaries = np.array(given, float).reshape(4, 2)
-        if not primaries.any() or np.abs(primaries - REC709).max() < SAME_CHROMATICITY:
-            return rows
-        matrix = (np.linalg.inv(_xyz_from_rgb(REC709)) @ _xyz_from_rgb(primaries)).astype(np.float32)
-        if not np.abs(matrix).max() < LARGEST_GAIN:
-            raise ValueError("they span no colours")
-    return lambda begin, end: rows(begin, end).astype(np.float32) @ matrix.T
-
-
-def _xyz_from_rgb(primaries: Shaped[np.ndarray, "4 2"]) -> Shaped[np.ndarray, "3 3"]:
-    """Return the matrix of primaries whose sum is white of luminance 1."""
-    x, y = primaries.T
-    xyz = np.stack([x, y, 1 - x - y])
-    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3] / y[3])
-
-
-def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[int]:
-    """Return the indices of the red, green and blue channels, equal for grey; InputError if there are neither."""
-    names = list(spec.channelnames)
-    if set("RGB") <= set(names):
-        return [names.index(name) for name in "RGB"]
-    colours = [index for index in range(len(names)) if index != spec.alpha_channel and names[index] != "Z"]
-    if len(colours) != 1:
-        raise InputError(
-            f"has the channels {', '.join(names)}: neither grey nor RGB",
-            file=path,
-            key=key,
-            cure="save it as RGB or grey, in one layer",
-        )
-    return 3 * colours
+        return ColourSpace(LINEAR.curves, to_rec709(np.array(given, float).reshape(4, 2), adapted=False))
 
 
 def check_pixels(size: tuple[int, int], most_megapixels: float, path: str | Path, key: str | None = None) -> None:

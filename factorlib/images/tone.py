@@ -76,6 +76,7 @@ def _range(exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]
 
 
 Values = Float[np.ndarray, "*shape"]
+Curve = Callable[[Values], Values]  # from encoded values to linear ones
 
 
 def srgb_decode(encoded: Values) -> Values:
@@ -98,10 +99,10 @@ def srgb_encode(linear: Values) -> Values:
     return np.copysign(np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055), linear)
 
 
-def gamma_decode(encoded: Values) -> Values:
-    """Convert values with the encoding gamma2.2 to linear ones: encoded^2.2."""
-    return np.copysign(np.abs(encoded) ** 2.2, encoded)
+def power_decode(exponent: float) -> Curve:
+    """Return the function from encoded values to linear ones, encoded^exponent, continued as an odd function."""
+    return lambda encoded: np.copysign(np.abs(encoded) ** exponent, encoded)
 
 
-# functions from encoded values to linear ones, by encoding
-DECODERS: dict[str, Callable[[Values], Values]] = {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}
+# curves by the name of the encoding
+DECODERS: dict[str, Curve] = {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": power_decode(2.2)}

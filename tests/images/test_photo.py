@@ -22,7 +22,13 @@ RADIANCE = RNG.uniform(0, 0.9, (12, 18, 3)).astype(np.float32)  # 3:2, below cli
 
 def save(path, pixels, names=None, window=(), **attributes):
     """Write an image in the type of `pixels`; attribute names with `__` for `:`."""
-    kind = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float16": oiio.HALF, "float32": oiio.FLOAT}[pixels.dtype.name]
+    kind = {
+        "uint8": oiio.UINT8,
+        "uint16": oiio.UINT16,
+        "int16": oiio.INT16,
+        "float16": oiio.HALF,
+        "float32": oiio.FLOAT,
+    }[pixels.dtype.name]
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if names:
@@ -109,6 +115,83 @@ def test_exr_channels_go_by_name_and_without_colours_it_is_refused(tmp_path):
     assert photo.radiance[0, 0].tolist() == [2, 3, 1]
     path = save(tmp_path / "b.exr", pixels[..., :2], names=["normal.x", "normal.y"])
     assert refusal("normal.x, normal.y", read_photo, path).cure
+
+
+PARTS = {  # names of parts and channels, largest part -> the part or layer that is read, or words of the error
+    "beauty after others": ([("albedo", "RGB"), ("rgba", "RGBA"), ("normal", "RGB")], 1),
+    "Blender's": ([("ViewLayer.DiffCol", "RGB"), ("ViewLayer.Combined", "RGB")], 1),
+    "the only colours": ([("depth", "Z"), ("picture", "RGB"), ("normal", "XYZ")], 1),
+    "the largest": ([("preview", "RGB"), ("picture", "RGB")], 1),
+    "two views": ([("left", "RGB"), ("right", "RGB")], "which one is the photo is not clear: left, right"),
+    "two beauties": ([("a.Combined", "RGB"), ("b.Combined", "RGB")], "not clear: a.Combined, b.Combined"),
+    "pages": ([("", "RGB"), ("", "RGB")], "not clear: page 1, page 2"),
+}
+
+
+@pytest.mark.parametrize("case", PARTS)
+def test_the_part_of_a_file_that_is_the_picture_is_read_or_asked_for(tmp_path, case):
+    parts, expected = PARTS[case]
+    is_tiff = case in ("pages", "the largest")
+    path = tmp_path / ("a.tif" if is_tiff else "a.exr")
+    specs = [oiio.ImageSpec(18 - 9 * (name == "preview"), 12, len(channels), oiio.FLOAT) for name, channels in parts]
+    for spec, (name, channels) in zip(specs, parts):
+        spec.channelnames = list(channels)
+        spec.attribute("oiio:subimagename", name)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), specs[0] if is_tiff else specs)
+    for k, spec in enumerate(specs):
+        assert k == 0 or output.open(str(path), spec, "AppendSubimage")
+        assert output.write_image(np.full((spec.height, spec.width, spec.nchannels), k, np.float32))
+    output.close()
+    if isinstance(expected, str):
+        refusal(expected, open_photo, path)
+    else:
+        assert (read_photo(path).radiance == expected).all() and read_photo(path).width == 18
+
+
+@pytest.mark.parametrize("names, red", [
+    (["V.Depth.Z", "V.DiffCol.B", "V.DiffCol.G", "V.DiffCol.R", "V.Combined.B", "V.Combined.G", "V.Combined.R"], 6),
+    (["albedo.R", "albedo.G", "albedo.B", "B", "G", "R"], 5), (["N.X", "N.Y", "N.Z", "colour.R", "colour.G", "colour.B"], 3),
+])  # fmt: skip
+def test_the_layer_of_an_exr_that_is_the_picture_is_read(tmp_path, names, red):
+    pixels = np.broadcast_to(np.arange(len(names), dtype=np.float32), (4, 6, len(names)))
+    assert (read_photo(save(tmp_path / "a.exr", pixels, names)).radiance[..., 0] == red).all()
+
+
+def test_other_kinds_of_files_are_refused_by_name(tmp_path):
+    refusal("codes are of type int16", open_photo, save(tmp_path / "a.tif", codes(RADIANCE, np.int16)))
+    refusal("of aspect 2", open_photo, save(tmp_path / "a.exr", RADIANCE, PixelAspectRatio=2.0))
+    path = save(tmp_path / "a.hdr", RADIANCE)
+    path.write_bytes(path.read_bytes().replace(b"rle_rgbe", b"rle_xyze"))
+    assert "ra_xyze -r a.hdr" in refusal("is a Radiance picture of XYZE", open_photo, path).cure
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 12 +X 18\n" + 12 * b"\x80\x80\x80\x80\1\1\1\x11")
+    assert "ra_xyze" in refusal("truncated or damaged", read_photo, path).cure
+
+
+XMP = (  # of a JPEG with a gain map, and of the map
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
+    'xmlns:C="http://ns.google.com/photos/1.0/container/" xmlns:I="http://ns.google.com/photos/1.0/container/item/" '
+    'xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/" hdrgm:Version="1.0" %s</rdf:Description></rdf:RDF></x:xmpmeta>'
+)
+MAP = 'hdrgm:GainMapMin="0" hdrgm:GainMapMax="3" hdrgm:HDRCapacityMax="3">'
+PICTURE = (
+    '><C:Directory><rdf:Seq><rdf:li rdf:parseType="Resource"><C:Item I:Semantic="Primary" I:Mime="image/jpeg"/></rdf:li><rdf:li '
+    'rdf:parseType="Resource"><C:Item I:Semantic="GainMap" I:Mime="image/jpeg" I:Length="%d"/></rdf:li></rdf:Seq></C:Directory>'
+)
+
+
+@pytest.mark.parametrize("encoding", [None, "srgb"])
+def test_a_jpeg_with_a_gain_map_is_the_picture_that_other_programs_show(tmp_path, encoding):
+    picture = Image.fromarray(np.broadcast_to(np.linspace(20, 255, 36, dtype=np.uint8)[:, None], (24, 36, 3)).copy())
+    picture.convert("L").save(tmp_path / "map.jpg", xmp=(XMP % MAP).encode())
+    gain = (tmp_path / "map.jpg").read_bytes()
+    picture.save(tmp_path / "a.jpg", xmp=(XMP % (PICTURE % len(gain))).encode())
+    plain = read_photo(tmp_path / "a.jpg", encoding)
+    (tmp_path / "a.jpg").write_bytes((tmp_path / "a.jpg").read_bytes() + gain)
+    assert oiio.ImageInput.open(str(tmp_path / "a.jpg")).spec().format == oiio.HALF  # as OpenImageIO reads it
+    photo = read_photo(tmp_path / "a.jpg", encoding)
+    assert np.array_equal(photo.radiance, plain.radiance) and photo.encoding == "srgb"
+    assert np.array_equal(photo.clipped, plain.clipped) and photo.clipped.any()
 
 
 AP1 = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)  # ACES: red, green, blue, white
