@@ -31,6 +31,13 @@ FAILURES = (
     *(OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, AssertionError, RuntimeError),
     *(MemoryError, EOFError, SyntaxError, BufferError, ImportError, struct.error, zlib.error, msgspec.MsgspecError),
 )
+TERSE = {  # words for exceptions whose own are Python's
+    KeyError: "it has no entry {}",
+    LookupError: "it refers to an entry that it does not have",
+    TypeError: "a value in it is of another kind than expected",
+    AttributeError: "a value in it is of another kind than expected",
+    AssertionError: "its parts contradict each other",
+}
 COPY_AGAIN = "the file may be incomplete, or of another format than its suffix: copy it again from its source"
 MOST_BYTES = 1 << 30  # largest file that is read as a whole
 MOST_WORDS = 200  # longest message of a parser, characters
@@ -86,7 +93,9 @@ def _fault(error: BaseException, kind: str) -> str:
     >>> _fault(PermissionError(13, "Permission denied"), "a mesh")
     'cannot be read (Permission denied)'
     >>> _fault(IndexError("list index out of range"), "a mesh")
-    'not readable as a mesh (IndexError: list index out of range)'
+    'not readable as a mesh (it refers to an entry that it does not have)'
+    >>> _fault(KeyError("frames"), "JSON"), _fault(AssertionError(), "a mesh")
+    ("not readable as JSON (it has no entry 'frames')", 'not readable as a mesh (its parts contradict each other)')
     """
     if isinstance(error, RecursionError):
         return f"not readable as {kind}: it is nested too deeply"
@@ -94,10 +103,8 @@ def _fault(error: BaseException, kind: str) -> str:
         return f"not readable as {kind}: it does not fit into memory"
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
-    words = one_line(str(error))
-    if not words or isinstance(error, LookupError | TypeError | AttributeError | AssertionError):  # terse messages
-        words = ": ".join(filter(None, (type(error).__name__, words)))
-    return f"not readable as {kind} ({words})"
+    words = next((words.format(error) for family, words in TERSE.items() if isinstance(error, family)), str(error))
+    return f"not readable as {kind} ({one_line(words) or TERSE[AssertionError]})"
 
 
 def one_line(text: str) -> str:

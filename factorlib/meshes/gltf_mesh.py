@@ -1,119 +1,150 @@
 """Reader of glTF and GLB: the triangles of every node of the scene, in the scene's frame; each primitive is a part.
 
 The names of a part are that of its primitive (its mesh's, numbered from the second on: `chair`, `chair_1`), that of its
-node if the mesh has no other primitive, and that of its material. Sizes in the header are checked before any buffer is
-opened. trimesh decodes the buffers; it is imported on first use, which takes a third of a second. It would skip fans
-and take sparse accessors for zeros, so both are refused here.
+node if the mesh has no other primitive, and that of its material. Sizes in the header are checked before arrays are
+decoded.
 """
 
-import io
+import base64
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from factorlib.dataset.gltf_header import CURE, GltfHeader, Primitive, buffer_path, read_header
+from factorlib.dataset.gltf_header import BEFORE_JSON, GltfHeader, Primitive, buffer_path, read_header, unread
 from factorlib.errors import InputError
-from factorlib.meshes.triangle_soup import Limits, TriangleSoup, floats, no_normals, normals_at_corners
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, floats, normals_at_corners, strip_triangles
 from factorlib.reading import read_bytes
 
-POINTS = 0  # modes of primitives
-LINES = 1
-TRIANGLES = 4
+TRIANGLES = 4  # modes of primitives
 STRIP = 5
 FAN = 6
-DECODED = (POINTS, LINES, TRIANGLES, STRIP)  # modes to which trimesh gives a name and an array of vertices
 UNNAMED = "GLTF"
+KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # NumPy's names
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}  # numbers of an element
 
 
-Part = tuple[Primitive, tuple[str, ...], Float[np.ndarray, "4 4"]]  # primitive, its names, world_from_node
+Part = tuple[Primitive, tuple[str, ...], Float[np.ndarray, "n 4 4"]]  # primitive, its names, world_from_instance
 
 
 def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
     """Read a glTF or GLB file: check the sizes in its header, then decode the primitives and join them.
 
     Raises:
-        InputError: If the file is malformed or too large.
-        ValueError: If its nodes do not form a tree; other exceptions of trimesh are possible too.
+        InputError: If the file is too large, or is not read because of what it has.
+        ValueError: If it is malformed; LookupError is possible too.
     """
-    from trimesh.exchange.gltf import load_glb, load_gltf
-
     header = read_header(path, most_bytes=limits.bytes)
-    load = load_glb if path.suffix.lower() == ".glb" else load_gltf
-    try:
-        instances = [node.mesh for node in header.nodes if node.mesh is not None]
-        limits.check_parts(sum(len(header.meshes[mesh].primitives) for mesh in instances), path)
-        parts = _parts(header)
-        sizes = np.array([_size(primitive, header, path) for primitive, _, _ in parts], object).reshape(-1, 2)
+    meshes = (header.entry("meshes", node.mesh) for node in header.nodes if node.mesh is not None)
+    limits.check_parts(sum(len(mesh.primitives) for mesh in meshes), path)
+    with np.errstate(all="ignore"):  # values that are not finite are refused later
+        decoder = _Decoder(header, path, limits)
+        parts = _parts(header, decoder)
+        sizes = np.array([_size(header, primitive, len(places)) for primitive, _, places in parts], object).reshape(
+            -1, 2
+        )
         vertices, triangles = sizes.sum(axis=0).tolist()
         limits.check(vertices, triangles, path)
-        content = io.BytesIO(read_bytes(path, "glTF", most_bytes=limits.bytes))
-        with np.errstate(all="ignore"):  # values that are not finite are refused later
-            decoded = load(content, resolver=_BufferFiles(header, path, limits), skip_materials=True)["geometry"]
-            primitives = [each for mesh in header.meshes for each in mesh.primitives if each.mode in DECODED]
-            arrays = {id(each): array for each, array in zip(primitives, decoded.values(), strict=True)}
-            return _join_primitives([part for part, size in zip(parts, sizes) if size[1]], arrays, header)
-    except (LookupError, AssertionError) as error:
-        fault = f"its header names a node, an array or a part of a buffer that the file does not have ({error!r})"
-        raise InputError(fault, file=path, cure=CURE) from error
+        parts = [part for part, size in zip(parts, sizes) if size[1]]
+        pieces = [_piece(decoder, primitive, places) for primitive, _, places in parts] or [(np.empty((0, 3)),) * 3]
+    points, normals, faces = zip(*pieces)
+    starts = np.cumsum([0, *map(len, points)])
+    corners = np.concatenate([each + start for each, start in zip(faces, starts)]).astype(np.int64)
+    return TriangleSoup(
+        vertices=np.concatenate(points),
+        faces=corners,
+        part=np.repeat(np.arange(len(faces)), [len(each) for each in faces]),
+        parts=[names for _, names, _ in parts],
+        normals=normals_at_corners(np.concatenate(normals), corners),
+    )
 
 
-class _BufferFiles(dict[str, bytes]):
-    """Files of a glTF's buffers as trimesh asks for them, all together within the limits."""
+class _Decoder:
+    """Decoder of accessors, with the content of all buffers."""
 
     def __init__(self, header: GltfHeader, path: Path, limits: Limits):
-        super().__init__()
-        self.buffers = header.buffers
+        self.header = header
         self.path = path
-        self.bytes_left = limits.bytes
+        self.buffers: list[bytes] = []
+        self.cure = f"export it again without {unread(header.extensionsUsed) or 'sparse accessors'}, with all its data"
+        for index, buffer in enumerate(header.buffers):
+            if buffer.uri is None:  # the second chunk of a .glb
+                content = read_bytes(path, "glTF", most_bytes=limits.bytes)
+                start = BEFORE_JSON + int.from_bytes(content[12:16], "little") + 8  # behind the second chunk's header
+                content = content[start:] if index == 0 and content[start - 4 : start] == b"BIN\0" else b""
+            elif (name := buffer_path(buffer.uri)) is None:
+                content = base64.b64decode(buffer.uri.partition(";base64,")[2])
+            else:
+                left = limits.bytes - sum(map(len, self.buffers))
+                content = read_bytes(path.parent / name, "a glTF buffer", most_bytes=max(left, 0))
+            if len(content) < buffer.byteLength:
+                fault = f"buffers[{index}] has {len(content)} bytes, but the header states {buffer.byteLength}"
+                raise InputError(fault, file=path, cure=self.cure)
+            self.buffers.append(content)
 
-    def __missing__(self, uri: str) -> bytes:
-        """Return the content of the file at `uri`; InputError if it is shorter than the header states, or too large."""
-        name = buffer_path(uri)
-        if name is None:
-            raise ValueError("a buffer's data: URI is not base64")
-        content = read_bytes(self.path.parent / name, "a glTF buffer", most_bytes=max(self.bytes_left, 0))
-        self.bytes_left -= len(content)
-        index, length = max(((k, b.byteLength) for k, b in enumerate(self.buffers) if b.uri == uri), key=lambda k: k[1])
-        if len(content) < length:
-            raise InputError(
-                f"buffer {index} has {len(content)} bytes, but the header states {length}", file=self.path, cure=CURE
-            )
-        return content
+    def array(self, index: int, width: int, count: int | None = None) -> Float[np.ndarray, "n w"]:
+        """Return accessor `index` as floats; normalized integers become fractions.
+
+        Args:
+            index: Index of the accessor.
+            width: Number of numbers of an element.
+            count: Number of elements that it must have; None for any.
+        """
+        accessor = self.header.entry("accessors", index)
+        if accessor.bufferView is None or accessor.sparse is not None:
+            raise InputError(f"accessors[{index}] is sparse, or has no data", file=self.path, cure=self.cure)
+        count = accessor.count if count is None else count
+        if WIDTHS.get(accessor.type) != width or accessor.count != count:
+            has = f"accessors[{index}] has {accessor.count} elements of type {accessor.type}"
+            raise ValueError(f"{has}, where {count} of {width} numbers are needed")
+        view = self.header.entry("bufferViews", accessor.bufferView)
+        data = memoryview(self.buffers[view.buffer])[view.byteOffset :][: view.byteLength]
+        kind = np.dtype(KINDS[accessor.componentType])
+        stride = view.byteStride or kind.itemsize * width
+        needed = accessor.byteOffset + max(count - 1, 0) * stride + kind.itemsize * width
+        if needed > len(data):
+            raise ValueError(f"accessors[{index}] needs {needed:,} bytes of a buffer view, which has {len(data):,}")
+        values = floats(np.ndarray((count, width), kind, data, accessor.byteOffset, (stride, kind.itemsize)))
+        return np.maximum(values / np.iinfo(kind).max, -1) if accessor.normalized and kind.kind in "iu" else values
 
 
-def _parts(header: GltfHeader) -> list[Part]:
+def _parts(header: GltfHeader, decoder: _Decoder) -> list[Part]:
     """Return the primitives of the scene's nodes, in the order of the nodes; ValueError if they do not form a tree."""
     from trimesh.util import unique_name
 
     used: dict[str, None] = {}
     counts: dict[str | None, int] = {}
-    names: list[list[str]] = []
-    for mesh in header.meshes:
-        names.append([])
-        for _ in mesh.primitives:
-            names[-1].append(unique_name(mesh.name or UNNAMED, used, counts))
-            used[names[-1][-1]] = None
+    for mesh in (each for each in header.meshes for _ in each.primitives):
+        used[unique_name(mesh.name or UNNAMED, used, counts)] = None
+    unused = iter(used)
+    names = [[next(unused) for _ in mesh.primitives] for mesh in header.meshes]
     parts = []
     for index, world_from_node in sorted(_world_from_nodes(header).items()):
         node = header.nodes[index]
         if node.mesh is None:
             continue
+        if node.skin is not None or any(node.weights or header.meshes[node.mesh].weights):
+            raise InputError(
+                f"nodes[{index}] is posed by a skin or by morph targets, which are not read",
+                file=decoder.path,
+                cure="apply the armature and the shape keys in a mesh editor, and export it again without them",
+            )
+        world_from_instances = world_from_node @ _instances(
+            decoder, node.extensions.get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
+        )
         primitives = header.meshes[node.mesh].primitives
         node_name = (node.name or str(index)) if len(primitives) == 1 else None
         for name, primitive in zip(names[node.mesh], primitives):
-            material = header.materials[primitive.material].name if primitive.material is not None else None
+            material = None if primitive.material is None else header.entry("materials", primitive.material).name
             known = dict.fromkeys(filter(None, (name, node_name, material)))
-            parts.append((primitive, tuple(known), world_from_node))
+            parts.append((primitive, tuple(known), world_from_instances))
     return parts
 
 
 def _world_from_nodes(header: GltfHeader) -> dict[int, Float[np.ndarray, "4 4"]]:
     """Return world_from_node of every node of the scene; without scenes, of every node."""
-    from trimesh.transformations import quaternion_matrix
-
     if header.scenes:
-        roots = header.scenes[header.scene or 0].nodes
+        roots = header.entry("scenes", header.scene or 0).nodes
     else:
         below = {child for node in header.nodes for child in node.children}
         roots = [index for index in range(len(header.nodes)) if index not in below]
@@ -121,81 +152,82 @@ def _world_from_nodes(header: GltfHeader) -> dict[int, Float[np.ndarray, "4 4"]]
     waiting = [(index, np.eye(4)) for index in roots]
     while waiting:
         index, world_from_parent = waiting.pop()
-        node = header.nodes[index]
+        node = header.entry("nodes", index)
         if index in places:
             raise ValueError(f"its node {index} has two parents, or is its own ancestor")
-        if not any(node.rotation):
-            raise ValueError("the rotation of a node is the quaternion 0 0 0 0")
-        with np.errstate(all="ignore"):  # values that are not finite are refused with the vertices
-            # parent_from_node: the node's matrix, by columns; or scale, then rotation (x y z w), then translation
-            if node.matrix is not None:
-                parent_from_node = np.array(node.matrix, float).reshape(4, 4).T
-            else:
-                parent_from_node = quaternion_matrix(np.roll(node.rotation, 1))
-                parent_from_node[:3, :3] *= node.scale
-                parent_from_node[:3, 3] = node.translation
-            places[index] = world_from_parent @ parent_from_node
+        # parent_from_node: the node's matrix, by columns; or of translation, rotation and scale
+        if node.matrix is not None:
+            parent_from_node = np.array(node.matrix, float).reshape(4, 4).T
+        else:
+            parent_from_node = _transforms(*np.atleast_2d(node.translation, node.rotation, node.scale))[0]
+        places[index] = world_from_parent @ parent_from_node
         waiting += [(child, places[index]) for child in node.children]
     return places
 
 
-def _size(primitive: Primitive, header: GltfHeader, path: Path) -> tuple[int, int]:
-    """Return the numbers of vertices and triangles by the header; 0 for lines and points."""
-    if primitive.mode == FAN:
-        raise InputError("has a triangle fan, which is not read", file=path, cure="export it again, as triangles")
-    if primitive.mode not in (TRIANGLES, STRIP):
-        return 0, 0
-    if "POSITION" not in primitive.attributes:
-        raise InputError("a primitive has no positions (attribute POSITION)", file=path, cure=CURE)
-    used = [
-        header.accessors[primitive.attributes[name]] for name in ("POSITION", "NORMAL") if name in primitive.attributes
+def _transforms(
+    translation: Float[np.ndarray, "n 3"], rotation: Float[np.ndarray, "n 4"], scale: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Return the transforms that scale, then rotate (quaternions x y z w), then translate."""
+    from scipy.spatial.transform import Rotation
+
+    if not rotation.any(axis=1).all():
+        raise ValueError("the rotation of a node or an instance is the quaternion 0 0 0 0")
+    transforms = np.tile(np.eye(4), (len(rotation), 1, 1))
+    transforms[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None]
+    transforms[:, :3, 3] = translation
+    return transforms
+
+
+def _instances(decoder: _Decoder, accessors: dict[str, int]) -> Float[np.ndarray, "n 4 4"]:
+    """Return node_from_instance of each instance of a node; the identity if it has none."""
+    count = max((decoder.header.entry("accessors", index).count for index in accessors.values()), default=1)
+    Limits.check_parts(count, decoder.path)
+    values = [
+        decoder.array(accessors[name], len(value), count) if name in accessors else np.tile(value, (count, 1))
+        for name, value in (("TRANSLATION", (0, 0, 0)), ("ROTATION", (0, 0, 0, 1)), ("SCALE", (1, 1, 1)))
     ]
-    corners = used[0] if primitive.indices is None else header.accessors[primitive.indices]
-    if any(accessor.sparse is not None for accessor in (*used, corners)):
-        raise InputError(
-            "stores its triangles in a sparse accessor, which is not read",
-            file=path,
-            cure="export it again, without sparse accessors",
-        )
-    vertices = used[0].count
-    if used[-1].count != vertices:
-        fault = f"a primitive has {used[-1].count} normals for {vertices} positions; the counts must be equal"
-        raise InputError(fault, file=path, cure=CURE)
-    return vertices, corners.count // 3 if primitive.mode == TRIANGLES else max(corners.count - 2, 0)
+    return _transforms(*values)
 
 
-def _join_primitives(parts: list[Part], arrays: dict[int, dict], header: GltfHeader) -> TriangleSoup:
-    """Join all primitives in the scene's frame; normals transform by the cofactors of the linear part.
-
-    Args:
-        parts: Primitives with triangles.
-        arrays: Arrays of a primitive as trimesh decodes them, by its `id`.
-        header: Header of the file.
-    """
-    vertices = [np.empty((0, 3))]
-    faces = [np.empty((0, 3), np.int64)]
-    normals = [no_normals(0)]
-    offset = 0
-    for primitive, _, world_from_node in parts:
-        array = arrays[id(primitive)]
-        points = _vectors(array["vertices"], header.accessors[primitive.attributes["POSITION"]].normalized)
-        corners = array["faces"].astype(np.int64)
-        linear = world_from_node[:3, :3]
-        vertices.append(points @ linear.T + world_from_node[:3, 3])
-        cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
-        if "NORMAL" in primitive.attributes:
-            normals.append(normals_at_corners(_vectors(array["vertex_normals"], True) @ cofactor.T, corners))
-        else:
-            normals.append(no_normals(len(corners)))
-        faces.append(np.where((corners >= 0) & (corners < len(points)), corners + offset, -1))
-        offset += len(points)
-    part = np.repeat(np.arange(len(parts)), [len(each) for each in faces[1:]])
-    names = [names for _, names, _ in parts]
-    return TriangleSoup(np.concatenate(vertices), np.concatenate(faces), part, names, np.concatenate(normals))
+def _size(header: GltfHeader, primitive: Primitive, instances: int) -> tuple[int, int]:
+    """Return the numbers of vertices and triangles of all instances by the header; 0 for lines and points."""
+    if primitive.mode not in (TRIANGLES, STRIP, FAN):
+        return 0, 0
+    vertices = header.entry("accessors", primitive.attributes["POSITION"]).count
+    corners = vertices if primitive.indices is None else header.entry("accessors", primitive.indices).count
+    triangles = corners // 3 if primitive.mode == TRIANGLES else max(corners - 2, 0)
+    return instances * vertices, instances * triangles
 
 
-def _vectors(values: np.ndarray, normalized: bool) -> Float[np.ndarray, "v 3"]:
-    """Convert vectors to floats; normalized integers, which trimesh leaves as they are, to at most 1."""
-    if values.ndim != 2 or values.shape[1] != 3:
-        raise ValueError(f"a position or normal has {values.shape[-1]} numbers, not 3")
-    return floats(values) / (np.iinfo(values.dtype).max if normalized and values.dtype.kind in "iu" else 1)
+def _piece(
+    decoder: _Decoder, primitive: Primitive, places: Float[np.ndarray, "n 4 4"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, their normals and the triangles of all instances of a primitive, in the scene's frame."""
+    points = decoder.array(primitive.attributes["POSITION"], 3)
+    count = len(points)
+    normal = primitive.attributes.get("NORMAL")
+    normals = np.full_like(points, np.nan) if normal is None else decoder.array(normal, 3, count)
+    triangles = _triangles(decoder, primitive, count)
+    # normals are transformed by the cofactors of the linear part; a mirror image turns normals and triangles
+    linear = places[:, :3, :3]
+    mirrored = (np.linalg.det(linear) < 0)[:, None, None]
+    cofactor = np.cross(np.roll(linear, -1, axis=1), np.roll(linear, -2, axis=1)) * np.where(mirrored, -1, 1)
+    points = points @ linear.transpose(0, 2, 1) + places[:, None, :3, 3]
+    normals = normals @ cofactor.transpose(0, 2, 1)
+    faces = np.where(mirrored, triangles[:, ::-1], triangles) + count * np.arange(len(places))[:, None, None]
+    return points.reshape(-1, 3), normals.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def _triangles(decoder: _Decoder, primitive: Primitive, count: int) -> Int[np.ndarray, "t 3"]:
+    """Return the triangles of a primitive of `count` vertices; ValueError for a vertex that it does not have."""
+    values = np.arange(count) if primitive.indices is None else decoder.array(primitive.indices, 1)[:, 0]
+    corners = values.astype(np.int64)
+    cut = len(corners) % 3 if primitive.mode == TRIANGLES else 0
+    if cut or (corners != values).any() or corners.min() < 0 or corners.max() >= count:
+        raise ValueError(f"{len(corners)} corners of a primitive make no whole triangles of its {count} vertices")
+    if primitive.mode == STRIP:
+        return strip_triangles(corners)
+    if primitive.mode == FAN:
+        return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+    return corners.reshape(-1, 3)

@@ -1,7 +1,7 @@
 """Small reader of Wavefront OBJ that keeps names which general readers drop: `g`, `o`, and `usemtl` without a .mtl.
 
 It reads v, vn, f (polygons, negative indices, `v/vt/vn` in all its forms), g, o, usemtl, and continued lines.
-It never opens the .mtl: a part's name is in the OBJ itself.
+It never opens the .mtl: a part's name is in the OBJ itself. Free-form surfaces and included files are refused.
 """
 
 import re
@@ -16,7 +16,7 @@ from factorlib.meshes.triangle_soup import Limits, TriangleSoup, quoted, text_li
 MOST = 2**31  # greatest index in any file
 COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles
 NAMED = re.compile(r"\s*(usemtl|g|o)\s")
-CONTINUED = re.compile(rb"\\(\r\n|\r|\n|\Z)")  # line that continues in the next
+CONTINUED = re.compile(rb"(#[^\r\n]*)|\\(\r\n|\r|\n|\Z)")  # line that continues in the next; no comment does
 
 
 class _Tables:
@@ -39,7 +39,11 @@ class _Tables:
             self.coordinates[key].extend([float(word) for word in words[:3]])
         elif key in self.names:
             self.names[key] = tuple(words) if key == "g" else (" ".join(words),)
-        if key != "f":
+        elif key in ("surf", "bzp", "bsp", "call"):  # free-form surface, Bézier and B-spline patches, other file
+            raise ValueError(
+                "free-form surfaces and included files are not read: convert them to polygons of this file"
+            )
+        if key not in ("f", "fo"):
             return
         vertices = len(self.coordinates["v"]) // 3
         normals = len(self.coordinates["vn"]) // 3
@@ -84,7 +88,9 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """
     tables = _Tables()
     number = 0
-    for count, line in enumerate(text_lines(CONTINUED.sub(b"\v", content) if b"\\" in content else content)):
+    for count, line in enumerate(
+        text_lines(CONTINUED.sub(lambda match: match[1] or b"\v", content) if b"\\" in content else content)
+    ):
         number += 1 + line.count("\v")
         comment = r"\s#(?!\S)" if NAMED.match(line) else "#"  # `usemtl Material #1` is a name
         key, *words = re.split(comment, line, maxsplit=1)[0].split() or [""]

@@ -18,6 +18,7 @@ from factorlib.meshes.triangle_soup import (
     parse_numbers,
     quoted,
     single_part_soup,
+    strip_triangles,
     text_lines,
     triangulate,
 )
@@ -46,13 +47,13 @@ Elements = dict[str, tuple[int, Properties]]  # number of rows and their propert
 Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # numbers of all rows, concatenated, and the count of each row
 STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE | re.IGNORECASE)
-END_FACET = re.compile(rb"^[ \t]*endfacet\b", re.MULTILINE | re.IGNORECASE)
+END_FACET = re.compile(rb"^[ \t]*end[ \t]*facet\b", re.MULTILINE | re.IGNORECASE)
 COUNTS = re.compile(r"(?:(?:ST)?C?N?OFF)?\s*([0-9]+)\s+([0-9]+)[^\n]*")  # OFF itself is optional
 CURE = "the file may be incomplete, or of another format than its suffix: copy or export it again"
 
 
 def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
-    """Read vertices, polygons and, if all of nx, ny, nz are present, normals of a PLY file; textures are ignored.
+    """Read vertices, polygons, strips and, if all of nx, ny, nz are present, normals of a PLY; textures are ignored.
 
     Args:
         path: File, to be named in errors.
@@ -71,10 +72,12 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     columns = {} if order else _text_columns(content[start:], elements)
     for name, (count, properties) in elements.items() if order else ():
         columns[name], start = _columns(content, start, order, count, properties)
-    # corners of the faces: the list of a known name, or the only one
-    faces = columns.get("face", {})
-    corner_property = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
-    values, sizes = faces[corner_property] if corner_property else (np.empty(0), np.zeros(0, np.int64))
+    values, sizes = _corners(columns.get("face", {}))
+    if "tristrips" in columns:
+        strip_values, lengths = _corners(columns["tristrips"])
+        strips = strip_triangles(np.insert(floats(strip_values), np.cumsum(lengths), -1))
+        values = np.append(values, strips)
+        sizes = np.append(sizes, np.full(len(strips), 3))
     numbers = {name: floats(column) for name, (column, each) in columns.get("vertex", {}).items() if (each == 1).all()}
     if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
@@ -82,6 +85,12 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     normal_names = "nx", "ny", "nz"
     normals = np.stack([numbers[n] for n in normal_names], axis=1) if set(normal_names) <= numbers.keys() else None
     return _polygon_soup(points, values, sizes, path, limits, normals)
+
+
+def _corners(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of all polygons or strips, and their number in each: the list of a known name, or the only."""
+    name = next((name for name in CORNERS if name in columns), next(iter(columns)) if len(columns) == 1 else None)
+    return columns[name] if name else (np.empty(0), np.zeros(0, np.int64))
 
 
 def _polygon_soup(
@@ -210,7 +219,8 @@ def _columns(content: bytes, offset: int, order: str, count: int, properties: Pr
         for number, (kind, counter) in enumerate(kinds):
             if counter:
                 fields.append((f"n{number}", counter, ()))
-                length = np.frombuffer(content, counter, 1, place)[0].item()
+                number_bytes = content[place : place + counter.itemsize].ljust(counter.itemsize, b"\0")
+                length = np.frombuffer(number_bytes, counter)[0].item()
                 if length < 0:
                     raise ValueError(f"a list has the length {length}, which must be at least 0")
                 place += counter.itemsize
@@ -277,16 +287,16 @@ def read_stl(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """
     binary_size = 84 + 50 * int.from_bytes(content[80:84], "little")
     if len(content) == binary_size:
-        corners = np.frombuffer(content, STL_ROW, offset=84)["corners"].reshape(-1, 3)
+        corners = np.frombuffer(content, STL_ROW, offset=84)["corners"]
     else:
-        corners = parse_numbers(b" ".join(VERTEX.findall(content))).reshape(-1, 3)
+        corners = parse_numbers(b" ".join(VERTEX.findall(content)))
         facets = len(END_FACET.findall(content))
-        if not 0 < len(corners) == 3 * facets:
-            fault = f"is neither a whole text STL ({len(corners)} corners of {facets} facets) "
+        if not 0 < len(corners) == 9 * facets:
+            fault = f"is neither a whole text STL ({len(corners) // 3} corners of {facets} facets) "
             fault += f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
             raise InputError(fault, file=path, cure=CURE)
-    limits.check(len(corners), len(corners) // 3, path)
-    return single_part_soup(corners, np.arange(len(corners)), path.stem)
+    limits.check(corners.size // 3, corners.size // 9, path)
+    return single_part_soup(corners, np.arange(corners.size // 3), path.stem)
 
 
 def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:

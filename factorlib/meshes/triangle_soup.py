@@ -176,6 +176,18 @@ def triangulate(
     return triangles
 
 
+def strip_triangles(corners: Int[np.ndarray, " c"]) -> Int[np.ndarray, "t 3"]:
+    """Return the triangles of strips that −1 separates: every other one of a strip is turned to agree with its first.
+
+    >>> strip_triangles(np.array([0, 1, 2, 3, -1, 4, 5, 6])).tolist()
+    [[0, 1, 2], [3, 2, 1], [4, 5, 6]]
+    """
+    place = np.arange(len(corners))
+    since = place - np.maximum.accumulate(np.where(corners == -1, place + 1, 0))  # number in its strip
+    triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    return np.where(since[:-2, None] % 2 == 1, triangles[:, ::-1], triangles)[(triangles != -1).all(axis=1)]
+
+
 def _clip_ears(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, " 3"]) -> Int[np.ndarray, "t 3"]:
     """Triangulate a simple polygon about a normal: cut off triangles of neighbours that hold no corner."""
     left = np.arange(len(points))

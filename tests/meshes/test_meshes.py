@@ -1,11 +1,12 @@
 """Meshes: what is read of files and what is refused, smooth normals, and subdivision."""
 
 import logging
+import re
+import struct
 
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipped_faces
 from factorlib.meshes.ply_stl_off import submesh, write_ply
@@ -13,7 +14,7 @@ from factorlib.meshes.read_mesh import merged_normals, read_mesh, usable
 from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
 from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals, triangulate
 from tests.faults import sample
-from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put
+from tests.faults.sample import MESHES, OFF, STL_TEXT, glb, put
 from tests.refusal import refusal
 
 MATERIALS = ["red", "oak"]
@@ -94,19 +95,6 @@ def test_written_ply_is_read_again_and_is_the_same_bytes_and_a_submesh_holds_one
     assert sum(len(p.faces) for p in parts) == 12 and all(p.faces.max() == len(p.vertices) - 1 for p in parts)
 
 
-def test_gltf_nodes_lie_in_each_other_scaled_then_turned_then_moved(tmp_path):
-    turn, header, outer = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]), gltf_header(), np.eye(4)
-    outer[:3, 3] = (5, 6, 7)
-    header["nodes"] = [
-        {"matrix": outer.T.ravel().tolist(), "children": [1]},
-        {"mesh": 0, "scale": [1, 2, 3], "rotation": turn.as_quat().tolist(), "translation": [1, 0, 0]},
-    ]
-    (tmp_path / "a.glb").write_bytes(glb(header))
-    expected = turn.apply(VERTICES * (1, 2, 3)) + (6, 6, 7)
-    result = np.unique(read_mesh(tmp_path / "a.glb", MATERIALS, "red").vertices.round(5), axis=0)
-    assert np.allclose(result, np.unique(expected.round(5), axis=0), atol=2e-5)
-
-
 @pytest.mark.parametrize("suffix", ["ply", "glb"])
 def test_normals_of_the_file_are_used(tmp_path, suffix):
     ball = trimesh.creation.icosphere(subdivisions=1)
@@ -128,48 +116,99 @@ def test_the_tetrahedron_is_the_same_in_every_format_and_no_larger_than_allowed(
     assert "simplify" in refusal("4 triangles", read_mesh, path, MATERIALS, "red", limits=Limits(triangles=3)).cure
 
 
-def test_gltf_strips_and_repeated_primitives_are_read_and_fans_and_sparse_accessors_refused(tmp_path):
-    header = gltf_header()
-    header["accessors"][1]["count"] = 4
-    header["meshes"][0]["primitives"][0]["mode"] = 5
-    data = DATA[:48] + np.array([0, 1, 2, 3], "<u2").tobytes().ljust(24, b"\0")
-    assert len(read_all(tmp_path / "a.glb", glb(header, data)).faces) == 2
-    header["meshes"][0]["primitives"][0]["mode"] = 6
-    refusal("triangle fan", read_all, tmp_path / "a.glb", glb(header, data))
-    header = gltf_header()
-    indices, values = {"bufferView": 1, "componentType": 5121}, {"bufferView": 0}
-    header["accessors"][0]["sparse"] = {"count": 1, "indices": indices, "values": values}
-    refusal("sparse accessor", read_all, tmp_path / "a.glb", glb(header))
-    header = gltf_header()
-    header["meshes"][0]["primitives"] *= 3
-    header["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}]
-    assert len(read_all(tmp_path / "a.glb", glb(header)).faces) == 8
+# ── what a file means: its triangles, or the words with which it is refused ──────────────────────────────────────────
+
+SQUARE = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], "<f4")
+CORNER = SQUARE[:3]
+HALVES = [(0, 1, 2), (2, 1, 3)]  # corners of SQUARE
+COMPONENTS = {"|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123, "<f4": 5126}
 
 
-def test_gltf_positions_of_normalized_integers_are_fractions(tmp_path):
-    header = gltf_header()
-    header["accessors"][0] |= {"componentType": 5123, "normalized": True}
-    header["bufferViews"][0] |= {"byteStride": 12}
-    data = np.pad((VERTICES * 65535).astype("<u2"), ((0, 0), (0, 3))).tobytes() + DATA[48:]
-    assert read_all(tmp_path / "a.glb", glb(header, data)).vertices.max() == 1
+def a_glb(*arrays, primitive=(), mesh=(), node=(), accessor=(), view=(), **header) -> bytes:
+    """A mesh whose positions are the first array; integers in columns are fractions."""
+    types = ["SCALAR" if each.ndim == 1 else f"VEC{each.shape[1]}" for each in arrays]
+    accessors = [
+        {"bufferView": k, "componentType": COMPONENTS[each.dtype.str], "count": len(each), "type": kind,
+         "normalized": kind != "SCALAR" and each.dtype != "f4"} for k, (each, kind) in enumerate(zip(arrays, types))
+    ]  # fmt: skip
+    views = [{"buffer": 0, "byteOffset": 99 * k, "byteLength": 99} for k in range(len(arrays))]
+    data = b"".join(each.tobytes().ljust(99, b"\0") for each in arrays)
+    parts = {"buffers": [{"byteLength": len(data)}], "nodes": [{"mesh": 0} | dict(node)], "asset": {"version": "2.0"}}
+    parts |= {
+        "accessors": [accessors[0] | dict(accessor), *accessors[1:]],
+        "bufferViews": [views[0] | dict(view), *views[1:]],
+    }
+    parts |= {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}} | dict(primitive)]} | dict(mesh)]}
+    return glb(parts | header, data)
 
 
-def binary_ply_of(*polygons):
-    faces = b"".join(bytes([len(polygon)]) + np.array(polygon, "<i4").tobytes() for polygon in polygons)
-    return PLY[: -len(PLY_FACES)].replace(b"face 4", b"face %d" % len(polygons)) + faces
+def ply_of(rows: str, *elements: str) -> str:
+    """A PLY of SQUARE, and of further elements, whose rows are lists."""
+    head = sample.PLY_HEADER.format("ascii").split("element face")[0]
+    head += "".join(f"element {each}\nproperty list int int vertex_indices\n" for each in elements)
+    return head + "end_header\n0 0 0\n1 0 0\n0 1 0\n1 1 0\n" + rows
 
 
-SQUARE_AND_TWO = ((0, 1, 3, 2), (0, 1, 2), (1, 2, 3))
-CUT = {"a.off": OFF[:-8], "a.ply": PLY_TEXT[:-8], "a.stl": STL_TEXT + STL_TEXT[:-40]}
+MOVES = np.array([(5, 0, 0), (0, 5, 0)], "<f4")
+TURNS = np.array([(0, 0, 0, 127), (0, 0, 90, 90)], "i1")  # by 0 and 90 degrees about z
+SIZES = np.array([(1, 1, 1), (-2, 1, 1)], "<f4")  # the second is a mirror image
+PLACES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1, "ROTATION": 2, "SCALE": 3}}}
+POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+UNREAD = ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression", "MSFT_lod", "ACME_shape"]
+SPARSE = {"count": 1, "indices": {"bufferView": 0, "componentType": 5121}, "values": {"bufferView": 0}}
+QUADS_OF_SHORTS = np.pad((CORNER * 32767).astype("<i2"), ((0, 0), (0, 3)))
+# what, its format and content -> triangles, as corners of SQUARE or as points, or a regular expression of the refusal
+MEANING = [
+    *((f"{name}.glb", a_glb(CORNER, extensionsRequired=[name]), f"requires {name}.*again without {name}") for name in UNREAD),
+    ("paint.glb", a_glb(CORNER, extensionsRequired=["KHR_materials_ior", "KHR_texture_basisu"]), HALVES[:1]),
+    ("draco alone.glb", a_glb(CORNER, extensionsUsed=UNREAD[:1], accessor={"bufferView": None}), "no data.*without KHR_draco"),
+    ("no fallback.glb", a_glb(CORNER, extensionsUsed=UNREAD[1:2], buffers=[{"byteLength": 512}]), "states 512.*without EXT_meshopt"),
+    ("sparse.glb", a_glb(CORNER, accessor={"sparse": SPARSE}), "without sparse accessors"),
+    ("skin.glb", a_glb(CORNER, node={"skin": 0}), r"nodes\[0\] is posed by a skin.*apply the armature"),
+    ("morph.glb", a_glb(CORNER, mesh={"weights": [0, 0.5]}), "morph targets"),
+    ("no morph.glb", a_glb(CORNER, mesh={"weights": [1]}, node={"weights": [0]}), HALVES[:1]),
+    ("instances.glb", a_glb(CORNER, MOVES, TURNS, SIZES, node={"extensions": PLACES, "scale": [1, 1, 2], "translation": [0, 0, 3]}),
+     [[(-1, 5, 3), (0, 3, 3), (0, 5, 3)], [(5, 0, 3), (6, 0, 3), (5, 1, 3)]]),
+    ("unequal.glb", a_glb(CORNER, MOVES, TURNS[:1], SIZES, node={"extensions": PLACES}), r"accessors\[2\] has 1 "),
+    ("nested.glb", a_glb(CORNER, nodes=[{"matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1], "children": [1]},
+     {"mesh": 0, "scale": [2, 3, 1], "rotation": [0, 0, 1, 1], "translation": [1, 0, 0]}]), [[(3, 6, 7), (6, 6, 7), (6, 8, 7)]]),
+    ("mirrored.glb", a_glb(CORNER, node={"scale": [-1, 1, 1]}), [[(-1, 0, 0), (0, 0, 0), (0, 1, 0)]]),
+    ("strip.glb", a_glb(SQUARE, np.arange(4, dtype="u1"), primitive={"mode": 5, "indices": 1}), HALVES),
+    ("fan.glb", a_glb(SQUARE[[0, 1, 3, 2]], primitive={"mode": 6}), [(0, 1, 3), (0, 3, 2)]),
+    ("quantized.glb", a_glb((CORNER * 4).astype("<i2"), accessor={"normalized": False}, node={"scale": [0.25] * 3},
+                            extensionsRequired=["KHR_mesh_quantization"]), HALVES[:1]),
+    ("fractions.glb", a_glb(QUADS_OF_SHORTS, accessor={"type": "VEC3"}, view={"byteStride": 12}), HALVES[:1]),
+    ("padded.glb", a_glb(CORNER, zeros="\0").replace(b', "zeros": "\\u0000"}', b"}" + bytes(19)), HALVES[:1]),
+    ("beyond.glb", a_glb(CORNER, primitive={"attributes": {"POSITION": 9}}), r"refers to accessors\[9\], but has 1 accessors"),
+    ("short.glb", a_glb(CORNER, accessor={"count": 9}), r"accessors\[0\] needs 108 bytes of a buffer view, which has 99"),
+    ("matrix.glb", a_glb(CORNER, node={"matrix": [1]}), r"length >= 16 - at `\$.nodes\[0\].matrix`"),
+    ("older.gltf", '{"asset": {"version": "1.0"}, "buffers": {}}', "is glTF 1.0.*as glTF 2.0"),
+    ("strips.ply", ply_of("8 0 1 2 3 3 -1 1 3\n3 1 3 2\n", "tristrips 2"), HALVES),
+    ("both.ply", ply_of("3 0 1 2\n3 1 3 2\n", "face 1", "tristrips 1"), HALVES),
+    ("lengths.ply", sample.PLY_HEADER.format("binary_little_endian").replace("face 4", "face 2").encode() + SQUARE.tobytes()
+     + struct.pack("<B2iB4i", 2, 0, 1, 4, 0, 1, 3, 2), [(0, 1, 3), (0, 3, 2)]),
+    ("cut.ply", ply_of("3 0 1 2\n3 1 3", "face 2"), "a row has fewer numbers"),
+    ("surface.obj", POINTS + "f 1 2 3\nsurf 0 1 0 1 1 2 3 4\n", "line 6.*free-form"),
+    ("other file.obj", POINTS + "f 1 2 3\ncall b.obj\n", "line 6.*included files"),
+    ("old face.obj", POINTS + "f 1 2 3\nfo 2 4 3\n", HALVES),
+    ("comment.obj", "# of C:\\things\\\n" + POINTS + "f 1 2 \\\n3\n", HALVES[:1]),
+    ("corners.stl", STL_TEXT.replace("vertex 1.0 0.0 0.0", "vertex 1.0", 1), "11 corners of 4 facets"),
+    ("twice.stl", STL_TEXT + STL_TEXT[:-40], "23 corners of 7 facets"),
+    ("spaced.stl", "\n".join(["facet", *(f"vertex {x:g} {y:g} 0" for x, y, _ in CORNER), "end facet"]), HALVES[:1]),
+    ("cut.off", OFF[:-8], "ends in the middle"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CUT)
-def test_a_truncated_text_is_refused(tmp_path, name):
-    refusal(".", read_all, tmp_path / name, CUT[name])
-
-
-def test_polygons_of_different_lengths_in_a_binary_ply_are_read(tmp_path):
-    assert len(read_all(tmp_path / "a.ply", binary_ply_of(*SQUARE_AND_TWO)).faces) == 4
+@pytest.mark.parametrize("name, content, meaning", MEANING, ids=[name for name, *_ in MEANING])
+def test_a_file_is_read_as_its_format_defines_or_refused_by_name(tmp_path, name, content, meaning):
+    if isinstance(meaning, str):
+        error = refusal(".", read_all, tmp_path / name, content)
+        assert re.search(meaning, f"{error.fault} {error.cure}"), str(error)
+        return
+    mesh = read_all(tmp_path / name, content)
+    wanted = [(SQUARE[list(each)] if np.ndim(each) == 1 else np.array(each)).tolist() for each in meaning]
+    corners = mesh.vertices[mesh.faces].round(2)
+    assert sorted(np.roll(each, -np.lexsort(each.T[::-1])[0], axis=0).tolist() for each in corners) == sorted(wanted)
 
 
 # an L, whose fan about any corner but two leaves it, with the numbers of colours behind its row
