@@ -32,6 +32,8 @@ FAILURES = (
     *(MemoryError, EOFError, SyntaxError, BufferError, ImportError, struct.error, zlib.error, msgspec.MsgspecError),
 )
 TERSE = {  # words for exceptions whose own are Python's
+    UnicodeDecodeError: "its text is damaged, or not UTF-8",
+    struct.error: "it ends too early",
     KeyError: "it has no entry {}",
     LookupError: "it refers to an entry that it does not have",
     TypeError: "a value in it is of another kind than expected",

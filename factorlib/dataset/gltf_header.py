@@ -195,7 +195,7 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
             )
         version = msgspec.json.decode(text, type=Versioned).asset.version
         if version.split(".")[0] != "2":
-            raise refusal(f"is glTF {version[:20]}", "export it again, as glTF 2.0")
+            raise refusal(f"is glTF {one_line(version[:20])}", "export it again, as glTF 2.0")
         header = msgspec.json.decode(text, type=GltfHeader)
     if names := unread(header.extensionsRequired):
         raise refusal(f"requires {names}, which is not read", f"export it again without {names}")

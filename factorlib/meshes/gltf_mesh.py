@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from factorlib.dataset.gltf_header import BEFORE_JSON, GltfHeader, Primitive, buffer_path, read_header, unread
+from factorlib.dataset.gltf_header import BEFORE_JSON, CURE, GltfHeader, Primitive, buffer_path, read_header, unread
 from factorlib.errors import InputError
 from factorlib.meshes.triangle_soup import Limits, TriangleSoup, floats, normals_at_corners, strip_triangles
 from factorlib.reading import read_bytes
@@ -40,10 +40,8 @@ def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
     with np.errstate(all="ignore"):  # values that are not finite are refused later
         decoder = _Decoder(header, path, limits)
         parts = _parts(header, decoder)
-        sizes = np.array([_size(header, primitive, len(places)) for primitive, _, places in parts], object).reshape(
-            -1, 2
-        )
-        vertices, triangles = sizes.sum(axis=0).tolist()
+        sizes = [_size(header, primitive, len(places)) for primitive, _, places in parts]
+        vertices, triangles = np.array(sizes, object).reshape(-1, 2).sum(axis=0).tolist()
         limits.check(vertices, triangles, path)
         parts = [part for part, size in zip(parts, sizes) if size[1]]
         pieces = [_piece(decoder, primitive, places) for primitive, _, places in parts] or [(np.empty((0, 3)),) * 3]
@@ -66,12 +64,11 @@ class _Decoder:
         self.header = header
         self.path = path
         self.buffers: list[bytes] = []
-        self.cure = f"export it again without {unread(header.extensionsUsed) or 'sparse accessors'}, with all its data"
         for index, buffer in enumerate(header.buffers):
             if buffer.uri is None:  # the second chunk of a .glb
-                content = read_bytes(path, "glTF", most_bytes=limits.bytes)
-                start = BEFORE_JSON + int.from_bytes(content[12:16], "little") + 8  # behind the second chunk's header
-                content = content[start:] if index == 0 and content[start - 4 : start] == b"BIN\0" else b""
+                content = b"" if index else read_bytes(path, "glTF", most_bytes=limits.bytes)
+                start = BEFORE_JSON + int.from_bytes(content[12:16], "little") + 8
+                content = content[start:] if content[start - 4 : start] == b"BIN\0" else b""
             elif (name := buffer_path(buffer.uri)) is None:
                 content = base64.b64decode(buffer.uri.partition(";base64,")[2])
             else:
@@ -79,7 +76,8 @@ class _Decoder:
                 content = read_bytes(path.parent / name, "a glTF buffer", most_bytes=max(left, 0))
             if len(content) < buffer.byteLength:
                 fault = f"buffers[{index}] has {len(content)} bytes, but the header states {buffer.byteLength}"
-                raise InputError(fault, file=path, cure=self.cure)
+                names = unread(header.extensionsUsed)
+                raise InputError(fault, file=path, cure=f"export it again without {names}" if names else CURE)
             self.buffers.append(content)
 
     def array(self, index: int, width: int, count: int | None = None) -> Float[np.ndarray, "n w"]:
@@ -92,7 +90,8 @@ class _Decoder:
         """
         accessor = self.header.entry("accessors", index)
         if accessor.bufferView is None or accessor.sparse is not None:
-            raise InputError(f"accessors[{index}] is sparse, or has no data", file=self.path, cure=self.cure)
+            cure = f"export it again without {unread([*self.header.extensionsUsed, 'sparse accessors'])}"
+            raise InputError(f"accessors[{index}] is sparse, or has no data", file=self.path, cure=cure)
         count = accessor.count if count is None else count
         if WIDTHS.get(accessor.type) != width or accessor.count != count:
             has = f"accessors[{index}] has {accessor.count} elements of type {accessor.type}"
@@ -225,7 +224,9 @@ def _triangles(decoder: _Decoder, primitive: Primitive, count: int) -> Int[np.nd
     corners = values.astype(np.int64)
     cut = len(corners) % 3 if primitive.mode == TRIANGLES else 0
     if cut or (corners != values).any() or corners.min() < 0 or corners.max() >= count:
-        raise ValueError(f"{len(corners)} corners of a primitive make no whole triangles of its {count} vertices")
+        raise ValueError(
+            f"the {len(corners)} corners of a primitive are no whole triangles, or not of its {count} vertices"
+        )
     if primitive.mode == STRIP:
         return strip_triangles(corners)
     if primitive.mode == FAN:

@@ -141,13 +141,10 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
                 case ["property", kind, name] if properties is not None and name not in properties:
                     properties[name] = TYPES[kind], None
                 case _:
-                    raise ValueError("it is not a line of a PLY header, or repeats a name")
+                    raise ValueError(line)
         except (ValueError, LookupError, TypeError) as error:
-            raise InputError(
-                f"its header has the line {quoted(' '.join(line.split()))} ({quoted(str(error))[1:-1]})",
-                file=path,
-                cure=CURE,
-            ) from error
+            fault = f"its header has {quoted(' '.join(line.split()))}, which no PLY header has, or has it twice"
+            raise InputError(fault, file=path, cure=CURE) from error
     if order is None:
         raise InputError("its header has no line `format`", file=path, cure=CURE)
     _check_room(elements, order, len(content) - start, path)

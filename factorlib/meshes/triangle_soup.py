@@ -1,11 +1,10 @@
 """Mesh as its file has it, before it is made usable: triangles, normals of their corners, names of their parts.
 
 Limits on its size are far above what a rough mesh needs, but within the memory of a usual machine. Text in mesh files
-is UTF-8, or else Latin-1, in which old programs write names and comments.
+is UTF-8, UTF-16 with its mark, or else Latin-1, in which old programs write names and comments.
 """
 
 import io
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -266,7 +265,7 @@ def text_lines(content: bytes) -> Iterator[str]:
         content.decode("utf-8-sig")
         encoding = "utf-8-sig"
     except UnicodeDecodeError:
-        encoding = "latin-1"
+        encoding = "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "latin-1"
     with io.TextIOWrapper(io.BytesIO(content), encoding) as text:  # line by line, since a list takes far more memory
         for line in text:
             if len(line) > LONGEST:
@@ -280,12 +279,10 @@ def parse_numbers(text: str | bytes) -> Float[np.ndarray, " n"]:
     >>> parse_numbers("1 2.5\n-3e2").tolist()
     [1.0, 2.5, -300.0]
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy only warns of text that is not a number
-        try:
-            return np.fromstring(text, dtype=float, sep=" ") if text.strip() else np.empty(0)
-        except DeprecationWarning:
-            raise ValueError("a word in it is not a number") from None
+    try:
+        return np.fromstring(text, dtype=float, sep=" ") if text.strip() else np.empty(0)
+    except ValueError:
+        raise ValueError("a word in it is not a number") from None
 
 
 def quoted(line: str) -> str:

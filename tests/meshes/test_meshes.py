@@ -190,6 +190,7 @@ MEANING = [
     ("cut.ply", ply_of("3 0 1 2\n3 1 3", "face 2"), "a row has fewer numbers"),
     ("surface.obj", POINTS + "f 1 2 3\nsurf 0 1 0 1 1 2 3 4\n", "line 6.*free-form"),
     ("other file.obj", POINTS + "f 1 2 3\ncall b.obj\n", "line 6.*included files"),
+    ("utf16.obj", (POINTS + "f 1 2 3\n").encode("utf-16"), HALVES[:1]),
     ("old face.obj", POINTS + "f 1 2 3\nfo 2 4 3\n", HALVES),
     ("comment.obj", "# of C:\\things\\\n" + POINTS + "f 1 2 \\\n3\n", HALVES[:1]),
     ("corners.stl", STL_TEXT.replace("vertex 1.0 0.0 0.0", "vertex 1.0", 1), "11 corners of 4 facets"),
