@@ -24,7 +24,8 @@ KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}  # numbers of an element
 
 
-Part = tuple[Primitive, tuple[str, ...], Float[np.ndarray, "n 4 4"]]  # primitive, its names, world_from_instance
+# primitive, its names, world_from_node, and the accessors of the node's instances by TRANSLATION, ROTATION and SCALE
+Part = tuple[Primitive, tuple[str, ...], Float[np.ndarray, "4 4"], dict[str, int]]
 
 
 def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
@@ -38,13 +39,13 @@ def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
     meshes = (header.entry("meshes", node.mesh) for node in header.nodes if node.mesh is not None)
     limits.check_parts(sum(len(mesh.primitives) for mesh in meshes), path)
     with np.errstate(all="ignore"):  # values that are not finite are refused later
-        decoder = _Decoder(header, path, limits)
-        parts = _parts(header, decoder)
-        sizes = [_size(header, primitive, len(places)) for primitive, _, places in parts]
+        parts = _parts(header, path)
+        sizes = [_size(header, primitive, instances) for primitive, _, _, instances in parts]
         vertices, triangles = np.array(sizes, object).reshape(-1, 2).sum(axis=0).tolist()
         limits.check(vertices, triangles, path)
         parts = [part for part, size in zip(parts, sizes) if size[1]]
-        pieces = [_piece(decoder, primitive, places) for primitive, _, places in parts] or [(np.empty((0, 3)),) * 3]
+        decoder = _Decoder(header, path, limits)
+        pieces = [_piece(decoder, part) for part in parts] or [(np.empty((0, 3)),) * 3]
     points, normals, faces = zip(*pieces)
     starts = np.cumsum([0, *map(len, points)])
     corners = np.concatenate([each + start for each, start in zip(faces, starts)]).astype(np.int64)
@@ -52,7 +53,7 @@ def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
         vertices=np.concatenate(points),
         faces=corners,
         part=np.repeat(np.arange(len(faces)), [len(each) for each in faces]),
-        parts=[names for _, names, _ in parts],
+        parts=[names for _, names, *_ in parts],
         normals=normals_at_corners(np.concatenate(normals), corners),
     )
 
@@ -107,7 +108,7 @@ class _Decoder:
         return np.maximum(values / np.iinfo(kind).max, -1) if accessor.normalized and kind.kind in "iu" else values
 
 
-def _parts(header: GltfHeader, decoder: _Decoder) -> list[Part]:
+def _parts(header: GltfHeader, path: Path) -> list[Part]:
     """Return the primitives of the scene's nodes, in the order of the nodes; ValueError if they do not form a tree."""
     from trimesh.util import unique_name
 
@@ -125,18 +126,16 @@ def _parts(header: GltfHeader, decoder: _Decoder) -> list[Part]:
         if node.skin is not None or any(node.weights or header.meshes[node.mesh].weights):
             raise InputError(
                 f"nodes[{index}] is posed by a skin or by morph targets, which are not read",
-                file=decoder.path,
+                file=path,
                 cure="apply the armature and the shape keys in a mesh editor, and export it again without them",
             )
-        world_from_instances = world_from_node @ _instances(
-            decoder, node.extensions.get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
-        )
+        instances = node.extensions.get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
         primitives = header.meshes[node.mesh].primitives
         node_name = (node.name or str(index)) if len(primitives) == 1 else None
         for name, primitive in zip(names[node.mesh], primitives):
             material = None if primitive.material is None else header.entry("materials", primitive.material).name
             known = dict.fromkeys(filter(None, (name, node_name, material)))
-            parts.append((primitive, tuple(known), world_from_instances))
+            parts.append((primitive, tuple(known), world_from_node, instances))
     return parts
 
 
@@ -181,7 +180,6 @@ def _transforms(
 def _instances(decoder: _Decoder, accessors: dict[str, int]) -> Float[np.ndarray, "n 4 4"]:
     """Return node_from_instance of each instance of a node; the identity if it has none."""
     count = max((decoder.header.entry("accessors", index).count for index in accessors.values()), default=1)
-    Limits.check_parts(count, decoder.path)
     values = [
         decoder.array(accessors[name], len(value), count) if name in accessors else np.tile(value, (count, 1))
         for name, value in (("TRANSLATION", (0, 0, 0)), ("ROTATION", (0, 0, 0, 1)), ("SCALE", (1, 1, 1)))
@@ -189,20 +187,20 @@ def _instances(decoder: _Decoder, accessors: dict[str, int]) -> Float[np.ndarray
     return _transforms(*values)
 
 
-def _size(header: GltfHeader, primitive: Primitive, instances: int) -> tuple[int, int]:
+def _size(header: GltfHeader, primitive: Primitive, instances: dict[str, int]) -> tuple[int, int]:
     """Return the numbers of vertices and triangles of all instances by the header; 0 for lines and points."""
     if primitive.mode not in (TRIANGLES, STRIP, FAN):
         return 0, 0
     vertices = header.entry("accessors", primitive.attributes["POSITION"]).count
     corners = vertices if primitive.indices is None else header.entry("accessors", primitive.indices).count
-    triangles = corners // 3 if primitive.mode == TRIANGLES else max(corners - 2, 0)
-    return instances * vertices, instances * triangles
+    copies = max((header.entry("accessors", index).count for index in instances.values()), default=1)
+    return copies * vertices, copies * (corners // 3 if primitive.mode == TRIANGLES else max(corners - 2, 0))
 
 
-def _piece(
-    decoder: _Decoder, primitive: Primitive, places: Float[np.ndarray, "n 4 4"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _piece(decoder: _Decoder, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, their normals and the triangles of all instances of a primitive, in the scene's frame."""
+    primitive, _, world_from_node, instances = part
+    places = world_from_node @ _instances(decoder, instances)
     points = decoder.array(primitive.attributes["POSITION"], 3)
     count = len(points)
     normal = primitive.attributes.get("NORMAL")
@@ -222,8 +220,7 @@ def _triangles(decoder: _Decoder, primitive: Primitive, count: int) -> Int[np.nd
     """Return the triangles of a primitive of `count` vertices; ValueError for a vertex that it does not have."""
     values = np.arange(count) if primitive.indices is None else decoder.array(primitive.indices, 1)[:, 0]
     corners = values.astype(np.int64)
-    cut = len(corners) % 3 if primitive.mode == TRIANGLES else 0
-    if cut or (corners != values).any() or corners.min() < 0 or corners.max() >= count:
+    if (primitive.mode == TRIANGLES and len(corners) % 3) or ((corners != values) | (corners < 0) | (corners >= count)).any():
         raise ValueError(
             f"the {len(corners)} corners of a primitive are no whole triangles, or not of its {count} vertices"
         )
