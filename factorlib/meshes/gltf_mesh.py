@@ -178,8 +178,8 @@ def _transforms(
 
 
 def _instances(decoder: _Decoder, accessors: dict[str, int]) -> Float[np.ndarray, "n 4 4"]:
-    """Return node_from_instance of each instance of a node; the identity if it has none."""
-    count = max((decoder.header.entry("accessors", index).count for index in accessors.values()), default=1)
+    """Return node_from_instance of each instance of a node."""
+    count = max(decoder.header.entry("accessors", index).count for index in accessors.values())
     values = [
         decoder.array(accessors[name], len(value), count) if name in accessors else np.tile(value, (count, 1))
         for name, value in (("TRANSLATION", (0, 0, 0)), ("ROTATION", (0, 0, 0, 1)), ("SCALE", (1, 1, 1)))
@@ -200,7 +200,7 @@ def _size(header: GltfHeader, primitive: Primitive, instances: dict[str, int]) -
 def _piece(decoder: _Decoder, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, their normals and the triangles of all instances of a primitive, in the scene's frame."""
     primitive, _, world_from_node, instances = part
-    places = world_from_node @ _instances(decoder, instances)
+    places = world_from_node @ _instances(decoder, instances) if instances else world_from_node[None]
     points = decoder.array(primitive.attributes["POSITION"], 3)
     count = len(points)
     normal = primitive.attributes.get("NORMAL")
@@ -220,7 +220,9 @@ def _triangles(decoder: _Decoder, primitive: Primitive, count: int) -> Int[np.nd
     """Return the triangles of a primitive of `count` vertices; ValueError for a vertex that it does not have."""
     values = np.arange(count) if primitive.indices is None else decoder.array(primitive.indices, 1)[:, 0]
     corners = values.astype(np.int64)
-    if (primitive.mode == TRIANGLES and len(corners) % 3) or ((corners != values) | (corners < 0) | (corners >= count)).any():
+    if (primitive.mode == TRIANGLES and len(corners) % 3) or (
+        (corners != values) | (corners < 0) | (corners >= count)
+    ).any():
         raise ValueError(
             f"the {len(corners)} corners of a primitive are no whole triangles, or not of its {count} vertices"
         )

@@ -157,7 +157,7 @@ def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"unknown mesh format {path.suffix!r}", file=path, cure="use one of " + ", ".join(FORMATS))
-    with reading(f"a mesh ({suffix[1:].upper()})", path, cure=CURE, also=(NameError,)):  # trimesh
+    with reading(f"a mesh ({suffix[1:].upper()})", path, cure=CURE):
         if suffix in WITHIN:
             soup = WITHIN[suffix](path, read_bytes(path, "a mesh", most_bytes=limits.bytes), limits)
         else:
