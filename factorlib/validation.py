@@ -1,11 +1,12 @@
 """Validation of files before anything runs: photos against masks, meshes against parts, and files of recipes.
 
 The checks are those that stages make first, by the same functions, and the consistency of materials in masks and
-dataset.yaml.  Only headers of photos are read.  The runner loads this module by name, as it loads stages.  It knows no
+dataset.yaml.  Of a photo, the header and the first and last row are read.  The runner loads this module by name, as it loads stages.  It knows no
 science, and a run with nothing to do must not import any.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,20 +40,24 @@ class Validation:
         self.file = dataset.folder.joinpath
         self._done: set[str] = set()
         self._parts: dict[str, list[tuple[str, ...]] | InputError] = {}
+        self._pixels: list[Check] = []
 
-    def faults(self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
-        """Return the faults of the files that a slice names, except those checked before.
+    def faults(self, requests: Iterable[tuple[str, str | None, dict[str, Any], Path]]) -> list[InputError]:
+        """Return the faults of the files that slices name, except those checked before.
 
-        Args:
-            slice_: name of the slice
-            photo: name of the photo; None for all
-            params: parameters of the stage that takes the slice
-            settings: the file that gives them, for errors
+        A request is the name of a slice; that of a photo, or None for all; the parameters of the stage that takes the
+        slice; and the file that gives them, for errors.  Pixels are read last, by a thread for each core.
         """
-        checks = dict(self._checks(slice_, photo, params, settings))
-        new = [check for check_name, check in checks.items() if check_name not in self._done]
+        checks: dict[str, Check] = {}
+        for request in requests:
+            for name, check in self._checks(*request):
+                checks.setdefault(name, check)
+        faults = _faults(check for name, check in checks.items() if name not in self._done)
         self._done |= checks.keys()
-        return _faults(new)
+        with ThreadPoolExecutor() as threads:
+            faults += sum(threads.map(lambda check: _faults([check]), self._pixels), [])
+        self._pixels.clear()
+        return faults
 
     def recipe_faults(self, files: dict[str, Path]) -> list[InputError]:
         """Return the faults of the light and mesh files that a recipe names.
@@ -138,9 +143,11 @@ class Validation:
     def _photo(self, entry: PhotoEntry, most_megapixels: float) -> None:
         key = f"photos[{entry.name}]"
         path = self.file(entry.image)
-        size = open_photo(path, f"{key}.image").size
+        opened = open_photo(path, f"{key}.image")
+        size = opened.size
         check_pixels(size, most_megapixels, path, f"{key}.image")
         check_values(path, most_megapixels, f"{key}.image")
+        self._pixels.append(partial(opened.check_pixels, path, f"{key}.image"))
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
         object_masks = [(obj.name, obj.mask) for obj in entry.objects]
         objects = read_object_indices(object_masks, self.file, size, f"{key}.objects")

@@ -11,6 +11,8 @@ three channels of the result are clipped. The picture is cropped as the file spe
 programs show it.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -107,12 +109,10 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
     """Open a raw photo; InputError if LibRaw cannot read the file."""
     import rawpy
 
-    try:
+    with _refused("not readable as a raw photo", path, key):
         sensor = rawpy.imread(str(path))
         sizes = sensor.sizes
         settings = sensor.other
-    except rawpy.LibRawError as error:
-        raise _refusal("not readable as a raw photo", error, path, key) from None
     rows, columns = _crop(sizes)
     camera = (
         settings.shutter_speed,
@@ -124,20 +124,22 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
     @cache
     def develop() -> tuple[np.ndarray, np.ndarray]:
         """Return 16-bit linear codes, not rotated, and a mask of saturated pixels."""
-        with sensor:
-            try:
-                pixels = sensor.postprocess(
-                    output_bps=16,
-                    gamma=(1, 1),
-                    no_auto_bright=True,
-                    use_camera_wb=True,
-                    output_color=rawpy.ColorSpace.sRGB,
-                    adjust_maximum_thr=0.0,
-                    user_flip=0,
-                )
-            except rawpy.LibRawError as error:
-                raise _refusal("cannot be developed", error, path, key) from None
+        with sensor, _refused("cannot be developed", path, key):
+            pixels = sensor.postprocess(
+                output_bps=16,
+                gamma=(1, 1),
+                no_auto_bright=True,
+                use_camera_wb=True,
+                output_color=rawpy.ColorSpace.sRGB,
+                adjust_maximum_thr=0.0,
+                user_flip=0,
+            )
             return pixels[rows, columns], _saturation_mask(sensor)[rows, columns]
+
+    def unpack() -> None:
+        """Read the sensor's pixels."""
+        with _refused("cannot be developed", path, key):
+            sensor.raw_image  # noqa: B018
 
     return OpenPhoto(
         width=columns.stop - columns.start,
@@ -148,19 +150,22 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
         space=LINEAR,
         rows=lambda begin, end: develop()[0][begin:end],
         saturated=lambda begin, end: np.repeat(develop()[1][begin:end, :, None], 3, axis=2),
+        unpack=unpack,
     )
 
 
-def _refusal(fault: str, error: Exception, path: str | Path, key: str | None) -> InputError:
-    """Return an InputError with the words of LibRaw and the command that develops the photo."""
-    text = error.args[0] if error.args else error
-    reason = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
-    return InputError(
-        f"{fault} ({reason})",
-        file=path,
-        key=key,
-        cure=f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif",
-    )
+@contextmanager
+def _refused(fault: str, path: str | Path, key: str | None) -> Iterator[None]:
+    """Raise LibRaw's errors as an InputError with its words and the command that develops the photo."""
+    import rawpy
+
+    try:
+        yield
+    except rawpy.LibRawError as error:
+        text = error.args[0] if error.args else error
+        reason = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+        cure = f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif"
+        raise InputError(f"{fault} ({reason})", file=path, key=key, cure=cure) from None
 
 
 def _crop(sizes: Any) -> tuple[slice, slice]:

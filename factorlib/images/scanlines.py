@@ -56,6 +56,7 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
     space          meaning of the codes
     rows           (begin, end) -> those rows, which are requested in order, each at most once
     saturated      (begin, end) -> mask of saturated values in those rows; None: values with codes near white
+    unpack         reads what the file stores without developing it; None: the first and last row tell enough
     """
 
     width: int
@@ -66,11 +67,29 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
     space: ColourSpace
     rows: Rows
     saturated: Callable[[int, int], Bool[np.ndarray, "r w 3"]] | None = None
+    unpack: Callable[[], object] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width as displayed."""
         return (self.width, self.height) if self.orientation >= 5 else (self.height, self.width)
+
+    def check_pixels(self, path: str | Path, key: str | None = None) -> None:
+        """Read the first and the last row, or unpack a raw photo.
+
+        Args:
+            path: File to name in the error.
+            key: Key to name in the error.
+
+        Raises:
+            InputError: If the file is truncated or damaged.
+        """
+        with reading("an image", path, key):
+            if self.unpack is not None:
+                self.unpack()
+            else:
+                self.rows(0, 1)
+                self.rows(self.height - 1, self.height)
 
     def clipped(self, begin: int, end: int, codes: Shaped[np.ndarray, "r w 3"]) -> Bool[np.ndarray, "r w 3"]:
         """Return the mask of saturated values in rows that were read as `codes`.

@@ -91,11 +91,12 @@ class DatasetState:
     def file_faults(self, steps: Iterable[Step]) -> list[str]:
         """List the faults of the files that steps and their recipes read, each once."""
         faults: list[InputError] = []
+        requests = []
         for step in steps:
             stage = self.spec.pipeline.stages[step.stage]
             faults += self.data.recipe_faults(self.recipes[step.recipe].files) if step.recipe is not None else []
-            for slice_ in stage.slices:
-                faults += self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)
+            requests += [(slice_, step.photo, stage.values, self.project.pipeline_file) for slice_ in stage.slices]
+        faults += self.data.faults(requests) if requests else []
         return list(dict.fromkeys(map(str, faults)))
 
     def parameter_faults(self, planned: list[PlannedStep]) -> list[str]:

@@ -44,8 +44,8 @@ class Data(msgspec.Struct, frozen=True):
     """Dataset as the runner sees it: its folder, its photos, its slices by name and photo, and its faults.
 
     slice:  has `facts`, JSON-able; `fields`, the facts by their names in the dataset's file; and `files`, their names
-    faults: those of a slice's files, as far as headers tell, given the parameters of the stage that takes the slice
-            and the file in which these stand
+    faults: those of the files of slices; a request is a slice, a photo or None, the parameters of the stage that takes
+            the slice, and the file in which these stand
     recipe: reads a recipe for this dataset; InputError if the recipe asks for what the dataset does not have
     recipe_faults: those of a recipe's files
     cautions: sentences about what runs, but leaves the answer ambiguous
@@ -54,7 +54,7 @@ class Data(msgspec.Struct, frozen=True):
     folder: Path
     photos: list[str]
     slice: Callable[[str, str | None], Any]
-    faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = lambda *_: []
+    faults: Callable[[list[tuple[str, str | None, dict[str, Any], Path]]], list[InputError]] = lambda _: []
     recipe: Callable[[Path], Recipe] = lambda _: Recipe({}, {})
     recipe_faults: Callable[[dict[str, Path]], list[InputError]] = lambda _: []
     cautions: Callable[[], list[str]] = list
@@ -105,7 +105,7 @@ def photo_sets() -> Provider:
             dataset.folder,
             [photo.name for photo in dataset.spec.photos],
             partial(dataset_slice, dataset),
-            lambda *words: validation().faults(*words),
+            lambda requests: validation().faults(requests),
             recipe,
             lambda files: validation().recipe_faults(files),
             lambda: validation().cautions(),

@@ -230,7 +230,7 @@ def show_params(project: Project, stages: list[str] | None) -> int:
 def validate(
     project: Project, dataset: str, settings: list[str], sheet: bool = False, held_out: Sequence[str] = ()
 ) -> int:
-    """Check pipeline.yaml, the settings, dataset.yaml and every file that it names (photos by their headers).
+    """Check pipeline.yaml, the settings, dataset.yaml and every file that it names (first and last rows of photos).
 
     sheet: first write build/<dataset>/sheet.png, each photo beside its labels and meshes
     held_out: names of photos to hold out

@@ -280,7 +280,7 @@ def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(fold
     (folder / "box.gltf").unlink()
     (folder / "box.obj").write_text("v 0 0 0\nv 1 0 0\nv .2 2 0\nf 1 2 3\n")
     spec["meshes"]["box"] = {"file": "box.obj", "material": "wood"}
-    faults = Validation(read_dataset(write(folder, spec))).faults("known", None, {}, folder)
+    faults = Validation(read_dataset(write(folder, spec))).faults([("known", None, {}, folder)])
     assert [fault.key for fault in faults] == ["known.illumination.garden", "known.illumination.kitchen.chrome"]
     assert "it is not a ball" in str(faults[1])
     spec["materials"].append("gold")

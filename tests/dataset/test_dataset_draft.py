@@ -122,11 +122,11 @@ def test_a_coco_file_names_the_materials_of_all_photos_and_what_is_no_name_is_to
     assert spec["materials"] == ["red_shell", "legs"] and {p["masks"] for p in spec["photos"]} == {"masks/all.json"}
     dataset = read_dataset(folder / "data" / "mine")
     arguments = "photo", None, {}, folder / "pipeline.yaml"
-    faults = Validation(dataset).faults(*arguments)
+    faults = Validation(dataset).faults([arguments])
     assert ["category 'red shell' is not a material" in str(fault) for fault in faults] == [True, True]
     file = folder / "data" / "mine" / "masks" / "all.json"
     file.write_text(file.read_text().replace("red shell", "red_shell"))
-    assert Validation(dataset).faults(*arguments) == []
+    assert Validation(dataset).faults([arguments]) == []
 
 
 def test_without_a_mesh_a_hull_by_structure_from_motion_is_written_and_that_is_said(folder):
@@ -162,7 +162,7 @@ def test_parts_get_the_materials_that_silhouettes_tell_and_objects_those_that_di
     assert "shell, legs" in missing[0] and len(missing) == 1
     file = folder / "data" / "mine" / "dataset.yaml"
     assert re.search(r"shell: label_1  # margin \d\.\d\d$", file.read_text(), re.MULTILINE)
-    assert Validation(read_dataset(file)).faults("photo", None, {}, folder) == []
+    assert Validation(read_dataset(file)).faults([("photo", None, {}, folder)]) == []
     shutil.rmtree(folder / "data")
     stripes = np.resize(np.array([1, 2, 3], np.uint8), (90, 120))  # of more materials than the chair has parts
     Image.fromarray(stripes).save(folder / "masks" / "p2.png")

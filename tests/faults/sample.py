@@ -344,7 +344,7 @@ def validated(slice_: str):
     """The first fault that `make validate` finds."""
 
     def read(folder: Path, _: str) -> None:
-        for fault in Validation(read_dataset(folder)).faults(slice_, None, {}, folder):
+        for fault in Validation(read_dataset(folder)).faults([(slice_, None, {}, folder)]):
             raise fault
 
     return read

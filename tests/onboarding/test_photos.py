@@ -58,7 +58,7 @@ def test_cut_outs_with_poses_become_a_valid_dataset_with_a_hull_and_a_focal_leng
     arguments = cut_outs / "capture", None, None, lambda share, text: steps.append(share)
     missing, notes = dataset_from_photos(cut_outs / "mine", *arguments)
     dataset = read_dataset(cut_outs / "mine")
-    assert missing == [] and Validation(dataset).faults("photo", None, {}, cut_outs) == []
+    assert missing == [] and Validation(dataset).faults([("photo", None, {}, cut_outs)]) == []
     assert dataset.spec.meshes["thing"].hull and {photo.light for photo in dataset.spec.photos} == {"room"}
     assert dataset.external["3"].focal_px == pytest.approx(CAMERA.focal, rel=0.1)
     assert "mask of 5 in" in notes[-1] and "differs" in notes[-1] and steps == sorted(steps)
@@ -75,7 +75,7 @@ def test_without_cameras_outlines_tell_whether_the_thing_is_a_body_of_revolution
     assert (SHAPE in missing, REVOLVED in notes) == (not revolved, revolved)
     if revolved:
         dataset = read_dataset(tmp_path / "mine")
-        assert dataset.spec.meshes["thing"].lathe and Validation(dataset).faults("photo", None, {}, tmp_path) == []
+        assert dataset.spec.meshes["thing"].lathe and Validation(dataset).faults([("photo", None, {}, tmp_path)]) == []
 
 
 class Brightest:
