@@ -40,7 +40,8 @@ LARGEST_GAIN = 100.0  # greatest factor between primaries; damaged ones have mor
 EXPORT = "export it again as sRGB, of 8 or 16 bits, or as a linear EXR"
 CURVES = {"RGB": (b"rTRC", b"gTRC", b"bTRC"), "GRAY": (b"kTRC",) * 3}  # tags of an ICC profile, by its colours
 COLORANTS = {"RGB": (b"rXYZ", b"gXYZ", b"bXYZ"), "GRAY": ()}
-UNCALIBRATED = 65535  # value of EXIF's ColorSpace
+EXIF_SRGB = 1  # values of EXIF's ColorSpace
+EXIF_ADOBE_RGB = 2  # not in the standard, but written by some programs
 Image.MAX_IMAGE_PIXELS = None  # of a photo or mask, whose size `check_pixels` limits
 log = logging.getLogger("factorlib.images")
 
@@ -152,9 +153,11 @@ def colour_space(
             return default if "srgb" in info else _png_space(info)
         if {Base.TransferFunction, Base.PrimaryChromaticities}.intersection(exif):
             return _tiff_space(exif, default)
-        if str(exif.get_ifd(IFD.Interop).get(Interop.InteropIndex, "")).startswith("R03"):
+        named = exif.get_ifd(IFD.Exif).get(Base.ColorSpace, EXIF_SRGB)
+        index = str(exif.get_ifd(IFD.Interop).get(Interop.InteropIndex, ""))
+        if index.startswith("R03") or named == EXIF_ADOBE_RGB:
             return ColourSpace((power_decode(563 / 256),) * 3, to_rec709(ADOBE_RGB))
-        if exif.get_ifd(IFD.Exif).get(Base.ColorSpace) == UNCALIBRATED:
+        if named != EXIF_SRGB:
             log.warning("%s: EXIF says that it is not sRGB, and no profile says what it is: taken for sRGB", path)
     return default
 

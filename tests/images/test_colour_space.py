@@ -98,10 +98,10 @@ def tiff(values, **tags):
     return pillow("tiff", Image.fromarray(codes(values)), tiffinfo=directory)
 
 
-def jpeg(values, index="R98", mode="RGB", **options):
-    """A JPEG with EXIF's ColorSpace, uncalibrated, and InteropIndex."""
+def jpeg(values, index="R98", mode="RGB", space=65535, **options):
+    """A JPEG with EXIF's ColorSpace, by default uncalibrated, and InteropIndex."""
     exif = Image.Exif()
-    exif.get_ifd(0x8769).update({0xA001: 65535, 0xA005: {1: index}})
+    exif.get_ifd(0x8769).update({0xA001: space, 0xA005: {1: index}})
     image = Image.fromarray(codes(values)).convert(mode)
     return pillow("jpeg", image, exif=exif, quality=100, subsampling=0, **options)
 
@@ -153,6 +153,7 @@ READ = {  # file, radiance, tolerance
         0.01,
     ),
     "EXIF, R03": (jpeg(stored(ADOBE, adobe), "R03"), WIDE, 0.03),
+    "EXIF, ColorSpace 2": (jpeg(stored(ADOBE, adobe), space=2), WIDE, 0.03),
     "HEIC, ICC": (heic(P3_PNG, icc_profile=icc(P3, SRGB_PARA)), WIDE, 0.01),
     "HEIC, nclx": (heic(P3_PNG, color_primaries=12, transfer_characteristics=13), WIDE, 0.01),
 }
