@@ -90,6 +90,14 @@ def earlier(tmp_path_factory, linked):
     return out, "\n".join(messages)
 
 
+def test_radiance_below_0_of_colours_beyond_rec709_is_solved_as_hardly_any_reflectance(tmp_path, linked, solved):
+    radiance = linked["a"].radiance.copy()
+    radiance[linked["a"].material == linked["a"].material.min(), 2] *= -0.1
+    out = run(tmp_path, linked | {"a": msgspec.structs.replace(linked["a"], radiance=radiance)}, tone="auto")
+    wide, plain = (np.array(table(folder)["materials"]["red"]["diffuse"]) for folder in (out, solved))
+    assert 0 <= wide[2] < 0.05 * plain[2] and (wide[:2] > 0.5 * plain[:2]).all()
+
+
 def test_writes_the_fixed_artifacts(solved):
     assert set(table(solved)) == {"materials", "gauge", "model"}
     for name in NAMES:
