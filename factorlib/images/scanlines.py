@@ -123,12 +123,41 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
         raise InputError(fault, file=path, key=key, cure=cure)
     spec, colours = _picture(source, path, key)
     _check_kind(spec, path, key)
+    orientation = spec.get_int_attribute("Orientation", 1)
+    attributes = {a.name: a.value for a in spec.extra_attribs}
+    white = WHITE.get(spec.format.basetype)
+    size = (spec.height, spec.width) if white else (spec.full_height, spec.full_width)
+    rows = _stored_rows(source, spec, colours, path, key)
+    if white is None and source.format_name() == "jpeg":
+        rows = _base_rows(path)
+        white = 2**8 - 1
+    elif white is None:
+        rows = _in_display_window(rows, spec)
+    if source.format_name() in ("openexr", "hdr"):
+        space = _scene_space(spec, head, path)
+    else:
+        space = colour_space(path, attributes, SRGB if white else LINEAR, key)
+    return OpenPhoto(
+        width=size[1],
+        height=size[0],
+        orientation=orientation if 1 <= orientation <= 8 else 1,
+        exif=attributes,
+        white=white,
+        space=space,
+        rows=rows,
+    )
+
+
+def _stored_rows(
+    source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], path: str | Path, key: str | None
+) -> Rows:
+    """Return the reader of rows as stored; from a tiled file, the rows of tiles that contain them are read."""
     first = min(colours)
     last = max(colours) + 1
     picked = [c - min(colours) for c in colours]
 
-    def stored_rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
-        """Read rows begin … end − 1; from a tiled file, the rows of tiles that contain them are read."""
+    def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
+        """Read rows begin … end − 1."""
         if tall := spec.tile_height:
             top = begin // tall * tall
             bottom = min(-(-end // tall) * tall, spec.height)
@@ -145,28 +174,7 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
             log.warning("%s: %s", path, one_line(error))
         return pixels.reshape(-1, spec.width, last - first)[begin - top : end - top, :, picked]
 
-    orientation = spec.get_int_attribute("Orientation", 1)
-    attributes = {a.name: a.value for a in spec.extra_attribs}
-    white = WHITE.get(spec.format.basetype)
-    size = (spec.height, spec.width) if white else (spec.full_height, spec.full_width)
-    rows: Rows = stored_rows
-    if source.format_name() in ("openexr", "hdr"):
-        rows = _in_display_window(rows, spec)
-        space = _scene_space(spec, head, path)
-    else:
-        if source.format_name() == "jpeg" and white is None:
-            rows = _base_rows(path)
-            white = 2**8 - 1
-        space = colour_space(path, attributes, SRGB if white else LINEAR, key)
-    return OpenPhoto(
-        width=size[1],
-        height=size[0],
-        orientation=orientation if 1 <= orientation <= 8 else 1,
-        exif=attributes,
-        white=white,
-        space=space,
-        rows=rows,
-    )
+    return rows
 
 
 def _picture(source: oiio.ImageInput, path: str | Path, key: str | None) -> tuple[oiio.ImageSpec, list[int]]:
@@ -245,6 +253,7 @@ def _base_rows(path: str | Path) -> Rows:
 
     @cache
     def base() -> Shaped[np.ndarray, "h w 3"]:
+        """Decode the picture."""
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
 
