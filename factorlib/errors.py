@@ -6,6 +6,7 @@ other exception is a defect of this project.
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable
 from difflib import get_close_matches
 from functools import partial
@@ -68,17 +69,23 @@ def raise_all(faults: list[InputError]) -> None:
 def did_you_mean(word: str, known: Iterable[object]) -> str:
     """Return a cure that names the nearest of the `known` words, or all of them.
 
+    The word itself is no suggestion, in any Unicode form. The same word in other case is the first one.
+
     >>> did_you_mean("soruce", ["source", "target"])
     "did you mean 'source'?"
     >>> did_you_mean("bogus", ["logs", "plan"])
     "known are: 'logs', 'plan'"
     >>> did_you_mean("x", ["source", "target"])
     "known are: 'source', 'target'"
+    >>> did_you_mean("Photo.JPG", ["Photo.png", "photo.jpg", "Photo.JPG"])
+    "did you mean 'photo.jpg'?"
     """
     known = sorted(str(k) for k in known)
     word = word.strip("[]'\"")
-    compared = known[:MOST_COMPARED]
+    composed = unicodedata.normalize("NFC", word)
+    compared = [k for k in known[:MOST_COMPARED] if unicodedata.normalize("NFC", k) != composed]
     same_initial = [k for k in compared if k[:1] == word[:1]]
-    near = get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, same_initial, 1)
+    near = [k for k in compared if unicodedata.normalize("NFC", k).casefold() == composed.casefold()]
+    near = near or get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, same_initial, 1)
     more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""
     return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known[:MOST_LISTED])) + more

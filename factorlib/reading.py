@@ -18,7 +18,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import msgspec
 
@@ -184,7 +184,7 @@ def path_inside(folder: str | os.PathLike, path: str) -> Path:
     """Return the target of a path relative to a folder, with links not yet followed; it need not exist.
 
     Raises:
-        ValueError: The path is absolute or empty, leads outside the folder (links followed), or cannot be followed.
+        ValueError: The path is absolute or empty, begins with a drive, leads outside the folder (links followed), or cannot be followed.
             Causes of the last are a NUL, a name of over 255 bytes, and links in a circle.
     """
     target = Path(folder) / path
@@ -195,6 +195,7 @@ def path_inside(folder: str | os.PathLike, path: str) -> Path:
     except (OSError, RuntimeError, ValueError) as error:
         words = one_line(getattr(error, "strerror", None) or str(error))
         raise ValueError(f"is not a path that can be followed ({words})") from error
-    if not path or Path(path).is_absolute() or not resolved.is_relative_to(Path(folder).resolve()):
+    drive = PureWindowsPath(path).drive and not os.path.lexists(target)
+    if not path or drive or Path(path).is_absolute() or not resolved.is_relative_to(Path(folder).resolve()):
         raise ValueError("leads outside the dataset")
     return target

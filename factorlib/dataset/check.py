@@ -24,7 +24,8 @@ from factorlib.dataset.schema import (
 from factorlib.errors import raise_all
 
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".heic", ".heif", ".hif", *RAW)
-MASKS = (".png", ".json")
+MASK_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".tga", ".pgm", ".pbm", ".ppm")
+MASKS = (*MASK_IMAGES, ".json")
 ONE_PART = (".ply", ".stl", ".off")  # formats with one part, which has the file's own name
 MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
@@ -224,7 +225,7 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
     for material, path in {} if isinstance(photo.masks, str) else photo.masks.items():
         with refuse.collect_fault():
             refuse.check_known(f"{key}.masks.{material}", material, spec.materials, "material")
-            refuse.check_path(f"{key}.masks.{material}", path, (".png",))
+            refuse.check_path(f"{key}.masks.{material}", path, MASK_IMAGES)
     with refuse.collect_fault():
         refuse.refuse_if(
             not photo.objects,
@@ -243,7 +244,7 @@ def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusa
     mesh = spec.meshes[obj.mesh]
     _check_parts(f"{key}.materials", obj.materials, mesh, spec.materials, refuse)
     if obj.mask is not None:
-        refuse.check_path(f"{key}.mask", obj.mask, (".png",))
+        refuse.check_path(f"{key}.mask", obj.mask, MASK_IMAGES)
     if obj.pose is not None:
         refuse.check_rotation(f"{key}.pose.rotation", obj.pose.rotation)
         refuse.refuse_if(

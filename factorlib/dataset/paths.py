@@ -5,9 +5,10 @@ Links are followed before a path is checked.
 
 import os
 import stat
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+import unicodedata
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePath, PurePosixPath
 from typing import NoReturn
 
 from factorlib.errors import InputError, did_you_mean
@@ -20,6 +21,36 @@ def labelmap_beside(masks: str, folder: Path) -> str | None:
     """Return the labelmap.txt in the folder of a mask or in the one above, both below the dataset's `folder`."""
     names = [str(above / "labelmap.txt") for above in PurePosixPath(masks).parents if above.name][:2]
     return next((name for name in names if (folder / name).is_file()), None)
+
+
+def plain_path(path: str | PurePath) -> PurePosixPath:
+    """Return a path as programs write it, with slashes for backslashes and composed letters (Unicode's NFC)."""
+    return PurePosixPath(unicodedata.normalize("NFC", str(path).replace("\\", "/")))
+
+
+def path_on_disk(folder: Path, path: str) -> str:
+    """Return a path with slashes for backslashes, and each of its names in the Unicode form that the disk has.
+
+    Args:
+        folder: folder that the path is relative to
+        path: the path, which may not exist
+    """
+    if ("\\" not in path and path.isascii()) or os.path.lexists(folder / path):
+        return path
+    target = PurePosixPath()
+    for part in PurePosixPath(path.replace("\\", "/")).parts:
+        with suppress(OSError, ValueError):  # no such folder
+            names = {} if os.path.lexists(folder / target / part) else os.listdir(folder / target)
+            part = next((name for name in names if plain_path(name) == plain_path(part)), part)
+        target /= part
+    return str(target)
+
+
+def nearest_paths(path: PurePath, others: Sequence[PurePosixPath]) -> list[PurePosixPath]:
+    """Return those of the other paths that share the most folders with a path: all, if none shares any."""
+    folders = set(path.parent.parts)
+    shared = [len(folders.intersection(other.parent.parts)) for other in others]
+    return [other for other, count in zip(others, shared) if count == max(shared)]
 
 
 class Refusal:
@@ -125,7 +156,8 @@ class Refusal:
             target.suffix.lower() not in suffixes,
             key,
             f"{path!r} has a suffix that is not read here",
-            f"expected one of {', '.join(suffixes)}",
+            f"expected one of {', '.join(suffixes)}"
+            + ("; of a Cryptomatte, export the matte of each material" if target.suffix.lower() == ".exr" else ""),
         )
         if file_exists(target, key):
             self._check_plain(key, path, target)

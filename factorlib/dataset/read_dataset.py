@@ -16,7 +16,7 @@ import msgspec
 
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.gltf_header import buffer_path, read_header
-from factorlib.dataset.paths import Refusal, file_exists
+from factorlib.dataset.paths import Refusal, file_exists, path_on_disk
 from factorlib.dataset.schema import Dataset, DatasetFile, ExternalCamera, TruthFile
 from factorlib.errors import InputError, raise_all
 from factorlib.reading import check_plain, path_inside, read_text, reading
@@ -28,6 +28,9 @@ MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 log = logging.getLogger("factorlib.dataset")
 UNKNOWN = "?"
 OPEN = "left_open"  # placeholder for `?` in a draft
+PATHS = re.compile(  # keys of paths
+    r".*\.(image|mask|file|colmap|transforms|bop)|.*\.masks(\.[^.]+)?|truth|known\.illumination\.[^.]+"
+)
 MOST_NAMED = 20  # open places or photos that an error lists
 
 
@@ -104,7 +107,7 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     text = read_text(file, "a YAML file", most_bytes=MOST_BYTES)
     value = parse_yaml(text, file)
     places: list[str] = []
-    value = _fill_placeholders(value, "", places)
+    value = _fill_placeholders(value, "", places, file.parent)
     faults = []
     if places:
         fault = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
@@ -143,17 +146,25 @@ def _is_within(key: str | None, other: str | None) -> bool:
     return key is not None and (key == other or key.startswith((f"{other}.", f"{other}[")))
 
 
-def _fill_placeholders(value: Any, key: str, places: list[str]) -> Any:
-    """Replace each `?`, which `make new` writes, by a placeholder and add its key to `places`."""
+def _fill_placeholders(value: Any, key: str, places: list[str], folder: Path) -> Any:
+    """Replace each `?`, which `make new` writes, by a placeholder and add its key to `places`; spell paths as the disk.
+
+    Args:
+        value: a value, or tree of values, of a YAML file
+        key: its key
+        places: keys of `?`
+        folder: folder that paths are relative to
+    """
     if isinstance(value, dict):
         return {
-            name: _fill_placeholders(item, f"{key}.{name}" if key else name, places) for name, item in value.items()
+            name: _fill_placeholders(item, f"{key}.{name}" if key else name, places, folder) for name, item in value.items()
         }
     if isinstance(value, list):
-        return [_fill_placeholders(item, f"{key}[{index}]", places) for index, item in enumerate(value)]
+        return [_fill_placeholders(item, f"{key}[{index}]", places, folder) for index, item in enumerate(value)]
     if value == UNKNOWN:
         places.append(key)
-    return OPEN if value == UNKNOWN else value
+        return OPEN
+    return path_on_disk(folder, value) if isinstance(value, str) and PATHS.fullmatch(key) else value
 
 
 def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:

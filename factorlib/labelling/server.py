@@ -27,7 +27,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from factorlib.dataset.check import IMAGES
-from factorlib.dataset.paths import Refusal, file_exists
+from factorlib.dataset.paths import Refusal, file_exists, path_on_disk
 from factorlib.dataset.read_dataset import FILE, UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
@@ -87,11 +87,11 @@ class MaskSet:
         spec = read_yaml(self.yaml, LabelledSet)
         refuse = Refusal(self.yaml, self.folder)
         self.materials = spec.materials
-        self.photos = spec.photos
+        self.photos = [msgspec.structs.replace(p, image=path_on_disk(self.folder, p.image)) for p in spec.photos]
         refuse.check_distinct("photos", (photo.name for photo in self.photos), "photo")
         for index, photo in enumerate(self.photos):
             key = f"photos[{index}].image"
-            mask = f"masks/{photo.name}.png" if photo.masks == UNKNOWN else photo.masks
+            mask = f"masks/{photo.name}.png" if photo.masks == UNKNOWN else path_on_disk(self.folder, photo.masks)
             refuse.check_path(key, photo.image, IMAGES)
             refuse.check_path(f"photos[{index}].masks", mask, (".png",), must_exist=False)
             self.files.append((self.folder / mask).resolve())

@@ -1,9 +1,10 @@
-"""Readers of mask files: PNG of one channel, PNG of colours with CVAT's labelmap.txt, COCO and labelme annotations.
+"""Readers of mask files: pictures of one channel or of CVAT's colours, and annotations of COCO and labelme.
 
-Pillow reads PNG, because it alone keeps the stored values: palette indices, not the palette's colours. It stretches
-grey of 2 or 4 bits to 8 bits, which is undone.
+Pillow reads pictures, because it alone keeps the stored values: palette indices of a PNG, not the palette's colours. It
+stretches grey of 2 or 4 bits to 8 bits, which is undone. Pictures are turned as EXIF says. Lossy formats (JPEG, most
+WebP) change values by some codes: they can be silhouettes, but hold no labels.
 
-The file of labelme becomes COCO's. Label Studio and Roboflow change the names of photos, which is undone. A polygon of
+The file of labelme becomes COCO's; its masks of pixels become RLE. Label Studio and Roboflow change the names of photos, which is undone. A polygon of
 fewer than three corners is empty.
 
 COCO masks are polygons, and RLE as counts or compressed, by category and file name. pycocotools fills the polygons. It
@@ -20,16 +21,18 @@ from pathlib import Path, PurePosixPath
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Int, UInt16
-from PIL import Image
+from PIL import Image, ImageOps
 from pycocotools import mask as pycocomask
 
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain, read_bytes, read_text, reading
 
-_STRETCH = {2: 85, 4: 17}  # code of 1 after grey of so many bits is stretched to 8
-_GREY = 0  # PNG colour types
-_PALETTE = 3
+FORMATS = ["PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "PPM", "TGA"]  # Pillow's names; TGA is known by its suffix alone
+MODES = ("1", "L", "P", "LA", "RGB", "RGBA", "I;16", "I;16B")  # Pillow's modes whose values are read as they are
+LOSSY = ("jpeg", "tiff_jpeg", "webp")  # compressions of a TIFF
+RINGING = 32  # greatest error of a lossy format, codes
+_STRETCH = {"L;2": 85, "L;4": 17}  # code of 1 after grey of so many bits is stretched to 8
 Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; a mask has the size of its photo, which is limited
 OVERSHOOT = 2.0  # a polygon may leave the image by this many pixels
 MOST_BYTES = 512_000_000  # greatest size of a file; a hundred thousand outlines take half of it
@@ -45,7 +48,7 @@ SIMPLER = "draw outlines with fewer corners, or export the file again"
 
 
 def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None) -> UInt16[np.ndarray, "h w"]:
-    """Read the stored values of a PNG.
+    """Read the stored values of a picture; of a lossy one 0 and 255.
 
     RGB is accepted only if R = G = B, alpha only if it is opaque.
 
@@ -58,16 +61,16 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
         Values.
 
     Raises:
-        InputError: If the file is not such a PNG, or has another size.
+        InputError: If the file is not such a picture, or has another size.
     """
-    return _values(_decode(path, key, size), path, key)
+    return _exact_values(_decode(path, key, size), path, key)
 
 
 def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
     """Read a mask of one object or material.
 
-    Inside are the values above half of the greatest one, which suits 0/1, 0/255 and soft edges. If the picture has
-    transparent pixels, its alpha is the mask.
+    Inside are the values above half of the greatest one, which suits 0/1, 0/255 and soft edges; of a lossy format those
+    above 127. If the picture has transparent pixels, its alpha is the mask.
 
     Args:
         path: File.
@@ -77,25 +80,25 @@ def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None)
     Returns:
         A mask.
     """
-    png = _decode(path, key, size)
-    if png.opaque is not None:
-        return png.opaque
-    values = _values(png, path, key)
-    return values > values.max() // 2  # in the values' own type, of which twice the greatest may be no number
+    picture = _decode(path, key, size)
+    if picture.opaque is not None:
+        return picture.opaque
+    values = _values(picture, path, key)
+    return values > (LEFT_OUT if picture.lossy else values.max()) // 2  # in the values' own type, of which twice the greatest may be no number
 
 
 def read_labels_in(path: str | Path, key: str, size: tuple[int, int] | None = None) -> set[int]:
-    """Return the labels in a PNG; none if it is a silhouette: transparency, 0 and 255 alone, or mostly bright greys.
+    """Return the labels in a picture; none if it is a silhouette: transparency, 0 and 255 alone, or mostly bright greys.
 
     Args:
         path: File.
         key: Key to name in errors.
         size: Expected height and width.
     """
-    png = _decode(path, key, size)
-    if png.opaque is not None and (png.pixels.ndim == 3 or png.pixels.max() > LARGEST_LABEL):
+    picture = _decode(path, key, size)
+    if picture.opaque is not None and (picture.pixels.ndim == 3 or picture.pixels.max() > LARGEST_LABEL):
         return set()
-    values = _values(png, path, key)
+    values = _exact_values(picture, path, key)
     present = set(np.unique(values).tolist()) - {0, LEFT_OUT}
     bright = 2 * np.count_nonzero(values > LEFT_OUT // 2) >= np.count_nonzero(values)
     is_matte = bright and max(present, default=0) > LARGEST_LABEL
@@ -111,7 +114,7 @@ def opaque_part(alpha: np.ndarray) -> Bool[np.ndarray, "h w"] | None:
 def read_colours(
     path: str | Path, labelmap: Path, materials: list[str], size: tuple[int, int], key: str
 ) -> UInt16[np.ndarray, "h w"] | None:
-    """Read the labels of a PNG whose colours a labelmap.txt of CVAT names; None for a grey PNG.
+    """Read the labels of a picture whose colours a labelmap.txt of CVAT names; None for a grey or a lossy one.
 
     Args:
         path: File.
@@ -124,8 +127,8 @@ def read_colours(
         InputError: If a file is damaged, or a colour or name is unknown.
     """
     names = read_labelmap(labelmap)
-    with reading("a PNG", path, key), Image.open(path, formats=["PNG"]) as image:
-        if image.mode not in ("P", "RGB", "RGBA"):
+    with reading("a picture", path, key), Image.open(path, formats=FORMATS) as image:
+        if image.mode not in ("P", "RGB", "RGBA") or image.format in ("JPEG", "WEBP"):
             return None
         check_size(image.size[::-1], size, path, key)
         colours = np.asarray(image.convert("RGB")).astype(np.int64) @ (1 << 16, 1 << 8, 1)
@@ -148,39 +151,68 @@ def read_labelmap(path: Path) -> dict[int, str]:
         return {int.from_bytes(bytes(map(int, colour.split(",")))): name for name, colour, *_ in rows}
 
 
-class _Png(msgspec.Struct, frozen=True):
-    """A PNG as Pillow decodes it, with its bit depth and colour type; `opaque` is None if no pixel is transparent."""
+class _Picture(msgspec.Struct, frozen=True):
+    """A picture as Pillow decodes it.
+
+    Attributes:
+        pixels: values
+        opaque: mask of the opaque pixels; None if no pixel is transparent
+        raw: Pillow's name of the stored form, such as "L;4" or "RGB;16B"
+        lossy: True if its format changes values
+    """
 
     pixels: np.ndarray
     opaque: np.ndarray | None
-    depth: int
-    colour_type: int
+    raw: str
+    lossy: bool
 
 
-def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Png:
-    """Decode a PNG, and check its size."""
-    check_plain(path, "a PNG", key)
-    with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:
-        check_size(image.size[::-1], size or image.size[::-1], path, key)
+def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Picture:
+    """Decode a picture as displayed, and check its size."""
+    check_plain(path, "a picture", key)
+    with reading("a picture", path, key, "save the mask again, as PNG"), Image.open(path, formats=FORMATS) as image:
+        size = size or image.size[::-1]
+        if sorted(image.size) != sorted(size):  # before anything is decoded
+            check_size(image.size[::-1], size, path, key)
+        if (count := getattr(image, "n_frames", 1)) > 1:
+            raise InputError(f"holds {count} pictures", file=path, key=key, cure="save the mask alone, as PNG")
+        raw = re.search(r"\b(L|LA|RGB|RGBA);\d+", str(image.tile))
+        lossy = image.format == "JPEG" or image.info.get("compression") in LOSSY
+        if image.format == "WEBP":
+            lossy = b"VP8L" not in Path(path).read_bytes()[: 1 << 16]
+        ImageOps.exif_transpose(image, in_place=True)
+        check_size(image.size[::-1], size, path, key)
+        if image.mode not in MODES or (image.mode == "P" and image.format != "PNG"):  # others may reorder a palette
+            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
         pixels = np.asarray(image)
         has_alpha = image.mode in ("P", "LA", "RGBA") and image.has_transparency_data
         opaque = opaque_part(np.asarray(image.convert("RGBA"))[..., 3]) if has_alpha else None
-    with Path(path).open("rb") as stream:  # after signature, IHDR's length and name, and size
-        depth, colour_type = stream.read(26)[24:26]
-    return _Png(pixels, opaque, depth, colour_type)
+    return _Picture(pixels, opaque, raw[0] if raw else "", lossy)
 
 
-def _values(png: _Png, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
-    """Return the stored values of a decoded PNG; InputError for colours and transparency."""
+def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
+    """Return the values of a decoded picture; if it is lossy, 0 and 255, which it must be near."""
+    values = _values(picture, path, key)
+    if not picture.lossy:
+        return values
+    white = np.count_nonzero(values >= LEFT_OUT - RINGING)
+    if np.count_nonzero(values) > 0 and 2 * np.count_nonzero(values > RINGING) >= 3 * white:
+        cure = "save labels as PNG; or, if it shows one material, write masks: {material: file}"
+        raise InputError("is of a lossy format, which changes labels", file=path, key=key, cure=cure)
+    return np.where(values > LEFT_OUT // 2, LEFT_OUT, 0).astype(np.uint16)
+
+
+def _values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
+    """Return the stored values of a decoded picture; InputError for colours and transparency."""
     fault = None
-    values = png.pixels
-    if png.depth == 16 and png.colour_type not in (_GREY, _PALETTE):  # Pillow keeps only the upper byte
+    values = picture.pixels
+    if values.ndim == 3 and ";16" in picture.raw:  # Pillow keeps only the upper byte
         fault = "has several channels of 16 bits"
         cure = "save labels in one channel of 8 bits"
     elif values.ndim == 3:
         colours = values[..., : 1 if values.shape[-1] == 2 else 3]
-        coloured = (colours != colours[..., :1]).any(axis=-1)
-        if png.opaque is not None:
+        coloured = np.ptp(colours, axis=-1) > (RINGING if picture.lossy else 0)
+        if picture.opaque is not None:
             fault = "has transparent pixels"
             cure = "save it without alpha: 0 is background; or, if it shows one material, write masks: {material: file}"
         elif coloured.any():
@@ -189,7 +221,7 @@ def _values(png: _Png, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
         values = colours[..., 0]
     if fault:
         raise InputError(fault, file=path, key=key, cure=cure)
-    return (values // (_STRETCH.get(png.depth, 1) if png.colour_type == _GREY else 1)).astype(np.uint16)
+    return (values // _STRETCH.get(picture.raw, 1)).astype(np.uint16)
 
 
 def check_size(size: Sequence[float], expected: Sequence[int], path: str | Path, key: str) -> None:

@@ -29,7 +29,7 @@ from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
 from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
-from factorlib.onboarding.photo_folder import Cameras, folder_and_stem
+from factorlib.onboarding.photo_folder import Cameras
 from factorlib.shapes.hull import agreement, agreements, focal_by_hull, hull_box
 from factorlib.shapes.lathe import is_revolved
 from factorlib.shapes.motion import PhotoForMotion, cameras_by_motion
@@ -131,7 +131,7 @@ def read_views(
 
     Args:
         images: the photos by name
-        masks: masks that lie beside them, by the stems of their names
+        masks: masks that lie beside them, by the photos' names
         model: ONNX file of a matting network; None: that of the extra `masks`
         folder: a temporary folder
         report: called with the completed share and the current activity
@@ -149,7 +149,7 @@ def read_views(
         pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
         uncertain = 0.0
         matted = None
-        if file := masks.get(folder_and_stem(path.name)[1]):
+        if file := masks.get(name):
             labels = list(read_labels_in(file, "PHOTOS", opened.size))
             mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
         elif (opaque := opaque_pixels(path)) is not None:
@@ -193,6 +193,7 @@ def cameras_of_folder(
         return [view.outline(name, images[name], focal) for name, view in views.items() if name in images]
 
     notes = [ONE_LIGHT]
+    images = match_source(paths, cameras)
     content = json.loads(cameras.files[0].read_text()) if "transforms" in cameras.source else {}
     if content and not any(key in lens for lens in (content, *content["frames"]) for key in FOCAL_KEYS):
         height, width = next(iter(views.values())).size
@@ -204,7 +205,7 @@ def cameras_of_folder(
         focal = focal_by_hull(outlines, max(width, height), lambda share: report(0.5 + 0.4 * share, "focal length"))
         write_json(file, content | {"fl_x": round(focal, 1)})
         notes.append(f"the cameras have no focal length: a hull fits the masks best at {focal:.0f} px, which is used")
-    images = match_source(paths, cameras)
+        images = match_source(paths, cameras)
     shared = {"illumination": "room"}
     by_photo = {
         name: shared | distorted_camera(images[name], view.size[1]) for name, view in views.items() if name in images

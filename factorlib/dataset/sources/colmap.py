@@ -7,6 +7,7 @@ ever or fills memory.
 
 import math
 import mmap
+import re
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ from factorlib.reading import one_line, reading
 KEY = "cameras.colmap"
 CURE = "name the folder of cameras and images (.bin or .txt), such as sparse/0"
 MODELS = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+POINTS = re.compile(r"(\s*[-+.\deE]+\s+[-+.\deE]+\s+-?\d+(?=\s|\Z))++\s*")  # x, y and the point's number, repeated
 MOST_NAME = 4096  # longest name of an image, bytes
 
 CameraLine = tuple[int, str, int, int, tuple[float, ...]]  # id, model, width, height, parameters
@@ -124,13 +126,18 @@ def _text_cameras(file: Path) -> Iterator[CameraLine]:
 
 
 def _text_images(file: Path) -> Iterator[ImageLine]:
-    """Yield images of two lines each; the second, of points, may be empty."""
+    """Yield images; the line of points after each may be empty, or missing, as programs without points write it."""
+    has_points = False
     with file.open(encoding="utf-8") as lines:
-        for line in filter(_has_content, lines):
+        for number, line in enumerate(lines, 1):
+            if not _has_content(line) or (has_points and POINTS.fullmatch(line)):
+                has_points = has_points and line.lstrip().startswith("#")
+                continue
             words = line.strip().split(maxsplit=9)
             if len(words) != 10:
-                raise ValueError(f"{one_line(line)!r} has {len(words)} words; the line of an image has 10")
-            next(lines, None)
+                fault = f"line {number}, {one_line(line)!r}, has {len(words)} words"
+                raise ValueError(f"{fault}; the line of an image has 10")
+            has_points = True
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 

@@ -6,12 +6,12 @@ precedence: an object with a pose or keypoints there gets no pose from the sourc
 
 import logging
 from collections.abc import Iterable, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import msgspec
 
 from factorlib.dataset.check import IMAGES
-from factorlib.dataset.paths import Refusal
+from factorlib.dataset.paths import Refusal, plain_path
 from factorlib.dataset.schema import (
     SOURCES,
     CameraSource,
@@ -93,10 +93,10 @@ def match_images(
         images: images of the source
         refuse: raises errors
     """
-    by_name = {image.name: image for image in images}
+    by_name = {image.name: image for image in images} | {str(plain_path(str(i.name))): i for i in images}
     by_pattern: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
     for image in images:
-        path = PurePosixPath(str(image.name).replace("\\", "/"))
+        path = plain_path(str(image.name))
         stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
         for pattern in (("id", image.name), ("path", *path.parts), ("file", path.name), ("stem", stem)):
             by_pattern.setdefault(pattern, []).append(image)
@@ -104,7 +104,7 @@ def match_images(
     for photo, place in paths.items():
         key = f"cameras.images.{photo}"
         if photo in chosen:
-            name = chosen[photo]
+            name = chosen[photo] if chosen[photo] in by_name else str(plain_path(str(chosen[photo])))
             cure = did_you_mean(str(name), by_name)
             refuse.refuse_if(name not in by_name, key, f"the source has no image {name!r}", cure)
             result[photo] = by_name[name]
@@ -126,7 +126,7 @@ def match_images(
 
 def _patterns(photo: str) -> list[list[tuple]]:
     """Return the names under which a photo may stand in a source, the strictest first."""
-    path = PurePosixPath(photo)
+    path = plain_path(photo)
     number = int(path.stem) if path.stem.isascii() and path.stem.isdigit() else None
     tails: list[tuple] = [("path", *path.parts[-length:]) for length in range(1, len(path.parts) + 1)]
     return [[("id", number)], tails, [("file", path.name)], [("stem", path.stem)]]

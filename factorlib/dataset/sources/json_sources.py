@@ -8,6 +8,7 @@ OpenCV's, and lengths are millimetres. Its pixel centres are whole numbers: the 
 map into the ray through (0, 0). Here they are at 0.5. It does not state the size of its images.
 """
 
+import logging
 import math
 from typing import Annotated
 
@@ -32,6 +33,9 @@ ImageId = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,18}\Z", description=IDS
 Nine = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]
 
 
+log = logging.getLogger("factorlib.dataset")
+
+
 class FrameCamera(msgspec.Struct, frozen=True):
     """Intrinsics that all frames share, or those of one frame, in pixels with centres at 0.5."""
 
@@ -53,10 +57,10 @@ class FrameCamera(msgspec.Struct, frozen=True):
 
 
 class Frame(FrameCamera, frozen=True, kw_only=True):
-    """An image and its camera; transform_matrix is world_from_camera in OpenGL's axes, with 3 or 4 rows."""
+    """An image and its camera; transform_matrix is world_from_camera in OpenGL's axes, with 3 or 4 rows, if known."""
 
     file_path: str
-    transform_matrix: list[Row4]
+    transform_matrix: list[Row4] | None = None
 
 
 class TransformsFile(FrameCamera, frozen=True, kw_only=True):
@@ -66,7 +70,10 @@ class TransformsFile(FrameCamera, frozen=True, kw_only=True):
 
 
 def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
-    """Read the frames of the dataset's file `path`, in its order; a frame's own lens overrides the file's."""
+    """Read the frames of the dataset's file `path`, in its order; a frame's own lens overrides the file's.
+
+    A warning names frames without a pose, which are left out.
+    """
     file = refuse.folder / path
     content = read_source(file, TransformsFile)
     refuse = Refusal(file, refuse.folder)
@@ -84,7 +91,9 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
         focal_known = lens.fl_x is not None or lens.camera_angle_x is not None
         centred = lens.cx is None or lens.cy is None
         matrix_key = f"{key}.transform_matrix"
-        rows = frame.transform_matrix
+        if (rows := frame.transform_matrix) is None:
+            log.warning("%s: %s: %s has no transform_matrix: its camera is not known", file, key, frame.file_path)
+            continue
         refuse.refuse_if(
             len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)),
             matrix_key,
@@ -96,6 +105,7 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
         cam_from_world = rigid_motion((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
         place = f"{file.name}: {key}"
         images.append(SourceImage(frame.file_path, camera, size, place, centred, focal_known, cam_from_world))
+    refuse.refuse_if(not images, "frames", "none has a transform_matrix", "register the photos, or remove this file")
     return images
 
 
