@@ -17,9 +17,10 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
+from unicodedata import normalize
 
 import msgspec
 import numpy as np
@@ -27,7 +28,8 @@ import numpy as np
 from factorlib.align.coarse import HIDDEN, match_parts
 from factorlib.align.silhouette import UNKNOWN as HIDES
 from factorlib.align.silhouette import Silhouette
-from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
+from factorlib.dataset.check import IMAGES, MASK_IMAGES, MASKS, MESHES, RESERVED_PHOTOS
+from factorlib.dataset.paths import plain_path
 from factorlib.dataset.read_dataset import UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME
 from factorlib.errors import InputError
@@ -93,13 +95,13 @@ class Masks(msgspec.Struct):
 
 
 def photos_in(photos: Path) -> tuple[dict[str, Path], dict[str, Path], Cameras | None]:
-    """Return the photos of a folder by name, masks by the stems of their photos' names, and cameras."""
+    """Return the photos of a folder by name, the masks of some by the same name, and cameras."""
     files, masks, cameras = read_photo_folder(photos, _files(photos, SUFFIXES, "PHOTOS", deep=True))
     images = _by_name(files, "PHOTOS", photos)
     if not images:
         fault = f"the folder has no photos ({', '.join(IMAGES[:6])}, …)"
         raise InputError(fault, file=photos, key="PHOTOS", cure="name the folder of the photos")
-    return images, masks, cameras
+    return images, {name: masks[path] for name, path in images.items() if path in masks}, cameras
 
 
 def new_dataset(
@@ -119,11 +121,13 @@ def new_dataset(
     """
     above = check_target(target)
     images, photo_masks, source = photos_in(photos)
-    masks, mask_files = _mask_files(masks, sorted(photo_masks.values()))
+    beside = {} if masks else photo_masks
+    masks, mask_files = _mask_files(masks, sorted(beside.values()))
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes else []  # including .mtl and buffers
     missing: list[str] = []
     paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
-    labelled = _masks(masks, mask_files, list(images), missing) if masks else _cut_outs(paths, images, missing)
+    images_of = {name: plain_path(path.relative_to(photos)) for name, path in images.items()}
+    labelled = _masks(masks, mask_files, images_of, beside, missing) if masks else _cut_outs(paths, images, missing)
     entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
     unmasked = [NO_MASK.format(photo) for photo in images if photo not in labelled.by_photo]
@@ -152,7 +156,7 @@ def _mask_files(masks: Path | None, beside: list[Path]) -> tuple[Path | None, li
     """Return the folder of masks and its files; without a folder, that of the masks beside the photos, if any."""
     if masks is None:
         return (Path(os.path.commonpath([path.parent for path in beside])), beside) if beside else (None, [])
-    return masks, _files(masks, (".png", ".json", LABELMAP), "MASKS", deep=True)
+    return masks, _files(masks, (*MASKS, LABELMAP), "MASKS", deep=True)
 
 
 def check_target(target: Path) -> Path:
@@ -228,18 +232,35 @@ def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[P
         raise known or InputError("no folder can be created here", file=above, key="DATASET", cure=cure) from error
 
 
-def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str]) -> Masks:
-    """Return the masks in a folder: of a labelmap.txt, of json files, or of PNGs."""
+def _masks(
+    folder: Path,
+    paths: list[Path],
+    photos: Mapping[str, PurePosixPath],
+    beside: Mapping[str, Path],
+    missing: list[str],
+) -> Masks:
+    """Return the masks in a folder: of a labelmap.txt, of json files, or of pictures.
+
+    Args:
+        folder: the folder
+        paths: the files
+        photos: path of each photo below the folder of photos
+        beside: mask of each photo that has one beside the photos, which needs no search by name
+        missing: receives what the user has to write
+    """
     file = {path: f"masks/{path.relative_to(folder)}" for path in paths}
-    if sources := [path for path in paths if path.suffix.lower() != ".png"]:
-        return _annotated_masks(file, sources, photos, missing)
+    tails = {path: _tails(plain_path(path.relative_to(folder))) for path in paths}
+    photo_of = _names_of(photos)
+    if sources := [path for path in paths if path.suffix.lower() not in MASK_IMAGES]:
+        by_file = {path: next((photo_of[tail] for tail in tails[path] if tail in photo_of), None) for path in paths}
+        return _annotated_masks(file, sources, by_file, list(photos), missing)
     labels = 0
     names: dict[str, None] = {}
     outlines = []
     masks = Masks()
-    whole, further = _masks_by_photo(folder, paths, photos)
+    whole, further = (beside, {}) if beside else _masks_by_photo(tails, photo_of)
     for photo in photos:
-        each = {name: file[path] for name, path in sorted(further[photo].items())}
+        each = {name: file[path] for name, path in sorted(further.get(photo, {}).items())}
         if photo in whole:
             check_values(whole[photo], key=photo)
             values = read_labels_in(whole[photo], photo)
@@ -255,11 +276,25 @@ def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str
     return masks
 
 
-def _annotated_masks(file: dict[Path, str], sources: list[Path], photos: list[str], missing: list[str]) -> Masks:
-    """Return the PNGs of a labelmap.txt, or the json of each photo or of all; `file` has their paths in the dataset."""
-    suffix = ".png" if sources[0].name == LABELMAP else ".json"
-    entries = [path for path in file if path.suffix.lower() == suffix and path.parent.name != "SegmentationObject"]
-    masks = Masks(by_photo={_word(path.stem): file[path] for path in entries if _word(path.stem) in photos})
+def _annotated_masks(
+    file: dict[Path, str],
+    sources: list[Path],
+    by_file: Mapping[Path, str | None],
+    photos: list[str],
+    missing: list[str],
+) -> Masks:
+    """Return the pictures of a labelmap.txt, or the json of each photo or of all.
+
+    Args:
+        file: path of each file in the dataset
+        sources: the files that are no pictures
+        by_file: name of the photo that a file is called as
+        photos: names of the photos
+        missing: receives what the user has to write
+    """
+    suffixes = MASK_IMAGES if sources[0].name == LABELMAP else (".json",)
+    entries = [path for path in file if path.suffix.lower() in suffixes and path.parent.name != "SegmentationObject"]
+    masks = Masks(by_photo={photo: file[path] for path in entries if (photo := by_file[path])})
     if not masks.by_photo:
         masks.by_photo = dict.fromkeys(photos, file[sources[0]])
         missing += [f"{file[path]}: a second COCO file is not used" for path in sources[1:]]
@@ -301,7 +336,10 @@ def _annotated_materials(path: Path, file: str, missing: list[str]) -> list[str]
     if path.name == LABELMAP:
         found = [name for name in read_labelmap(path).values() if name != BACKGROUND]
     else:
-        found = [category.name for category in read_annotations(path).categories]
+        coco = read_annotations(path)
+        used = {annotation.category_id for annotation in coco.annotations}
+        above = {each.supercategory for each in coco.categories}  # Roboflow names its project as a category
+        found = [each.name for each in coco.categories if each.id in used or each.name not in above]
     names = {name: _word(name) for name in found}
     for name, word in names.items():
         if word != name:
@@ -310,24 +348,45 @@ def _annotated_materials(path: Path, file: str, missing: list[str]) -> list[str]
     return list(names.values())
 
 
+def _tails(place: PurePosixPath) -> list[str]:
+    """Return the words of a path without its suffix, with all of its folders, then with fewer.
+
+    >>> _tails(PurePosixPath("rig/front/0001.png"))
+    ['rig_front_0001', 'front_0001', '0001']
+    """
+    parts = place.with_suffix("").parts
+    return [_word("_".join(parts[k:])) for k in range(len(parts))]
+
+
+def _names_of(photos: Mapping[str, PurePosixPath]) -> dict[str, str]:
+    """Return each photo's name by that name, and by the words of its path that no other photo has."""
+    words = [(word, name) for name, place in photos.items() for word in {*_tails(place)}]
+    times = Counter(word for word, _ in words)
+    return {word: name for word, name in words if times[word] == 1} | {name: name for name in photos}
+
+
 def _masks_by_photo(
-    folder: Path, paths: list[Path], photos: list[str]
+    tails: Mapping[Path, list[str]], names: Mapping[str, str]
 ) -> tuple[dict[str, Path], dict[str, dict[str, Path]]]:
-    """Return the mask with labels of each photo, and its masks of single materials or objects by their names."""
+    """Return the mask with labels of each photo, and its masks of single materials or objects by their names.
+
+    Args:
+        tails: result of `_tails` for each file
+        names: names of photos by words
+    """
     whole: dict[str, Path] = {}
-    further: dict[str, dict[str, Path]] = {photo: {} for photo in photos}
-    for path in paths:
-        name = _word(path.stem)
-        if name in further:  # Even kitchen_2.png may be the mask of a photo of that name.
-            if path.parent == folder:
-                whole.setdefault(name, path)
-        elif path.parent == folder:
-            for cut in (k for k, letter in enumerate(name) if letter == "_"):
-                if name[:cut] in further:
-                    material = name[cut + 1 :]
-                    further[name[:cut]][HULL if material.lower() in WHOLE else material] = path
-        elif path.parent.parent == folder and path.parent.name in further:
-            further[path.parent.name][name] = path
+    further: dict[str, dict[str, Path]] = {}
+    for path, words in tails.items():
+        words = words[: max(1, len(words) - 1)]  # not the name without any of its folders
+        if photo := next(
+            (names[word] for word in words if word in names), None
+        ):  # Even kitchen_2.png may be one's name.
+            whole.setdefault(photo, path)
+            continue
+        for word, cut in [(word, cut) for word in words for cut, letter in enumerate(word) if letter == "_"]:
+            if photo := names.get(word[:cut]):
+                material = word[cut + 1 :]
+                further.setdefault(photo, {})[HULL if material.lower() in WHOLE else material] = path
     return whole, further
 
 
@@ -456,4 +515,4 @@ def _word(text: str) -> str:
     >>> _word("IMG 0412 (1)")
     'IMG_0412_1'
     """
-    return re.sub(r"[^A-Za-z0-9-]+", "_", text).strip("_")[:LONGEST_NAME] or "unnamed"
+    return re.sub(r"[^A-Za-z0-9-]+", "_", normalize("NFC", text)).strip("_")[:LONGEST_NAME] or "unnamed"

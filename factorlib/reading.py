@@ -184,8 +184,8 @@ def path_inside(folder: str | os.PathLike, path: str) -> Path:
     """Return the target of a path relative to a folder, with links not yet followed; it need not exist.
 
     Raises:
-        ValueError: The path is absolute or empty, begins with a drive, leads outside the folder (links followed), or cannot be followed.
-            Causes of the last are a NUL, a name of over 255 bytes, and links in a circle.
+        ValueError: The path is absolute or empty, begins with a drive, leads outside the folder (links followed), or
+            cannot be followed.  Causes of the last are a NUL, a name of over 255 bytes, and links in a circle.
     """
     target = Path(folder) / path
     try:

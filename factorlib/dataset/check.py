@@ -24,7 +24,7 @@ from factorlib.dataset.schema import (
 from factorlib.errors import raise_all
 
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".heic", ".heif", ".hif", *RAW)
-MASK_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".tga", ".pgm", ".pbm", ".ppm")
+MASK_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".tga")
 MASKS = (*MASK_IMAGES, ".json")
 ONE_PART = (".ply", ".stl", ".off")  # formats with one part, which has the file's own name
 MESHES = (".obj", ".gltf", ".glb", *ONE_PART)

@@ -40,8 +40,8 @@ def path_on_disk(folder: Path, path: str) -> str:
     target = PurePosixPath()
     for part in PurePosixPath(path.replace("\\", "/")).parts:
         with suppress(OSError, ValueError):  # no such folder
-            names = {} if os.path.lexists(folder / target / part) else os.listdir(folder / target)
-            part = next((name for name in names if plain_path(name) == plain_path(part)), part)
+            same = [name for name in os.listdir(folder / target) if plain_path(name) == plain_path(part)]
+            part = min(same, key=lambda name: name != part, default=part)
         target /= part
     return str(target)
 

@@ -157,7 +157,8 @@ def _fill_placeholders(value: Any, key: str, places: list[str], folder: Path) ->
     """
     if isinstance(value, dict):
         return {
-            name: _fill_placeholders(item, f"{key}.{name}" if key else name, places, folder) for name, item in value.items()
+            name: _fill_placeholders(item, f"{key}.{name}" if key else name, places, folder)
+            for name, item in value.items()
         }
     if isinstance(value, list):
         return [_fill_placeholders(item, f"{key}[{index}]", places, folder) for index, item in enumerate(value)]

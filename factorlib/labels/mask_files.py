@@ -4,8 +4,8 @@ Pillow reads pictures, because it alone keeps the stored values: palette indices
 stretches grey of 2 or 4 bits to 8 bits, which is undone. Pictures are turned as EXIF says. Lossy formats (JPEG, most
 WebP) change values by some codes: they can be silhouettes, but hold no labels.
 
-The file of labelme becomes COCO's; its masks of pixels become RLE. Label Studio and Roboflow change the names of photos, which is undone. A polygon of
-fewer than three corners is empty.
+The file of labelme becomes COCO's; its masks of pixels become RLE. Label Studio and Roboflow change the names of
+photos, which is undone. A polygon of fewer than three corners is empty.
 
 COCO masks are polygons, and RLE as counts or compressed, by category and file name. pycocotools fills the polygons. It
 needs memory for every pixel of an outline, so the length of outlines is checked first. Run lengths are decoded here:
@@ -16,7 +16,9 @@ the number of runs and one picture. The shapes of other photos in the file are l
 import logging
 import re
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from io import BytesIO
+from pathlib import Path
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -24,11 +26,12 @@ from jaxtyping import Bool, Int, UInt16
 from PIL import Image, ImageOps
 from pycocotools import mask as pycocomask
 
+from factorlib.dataset.paths import nearest_paths, plain_path
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError, did_you_mean
-from factorlib.reading import check_plain, read_bytes, read_text, reading
+from factorlib.reading import check_plain, one_line, read_bytes, read_text, reading
 
-FORMATS = ["PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "PPM", "TGA"]  # Pillow's names; TGA is known by its suffix alone
+FORMATS = ["PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "TGA"]  # Pillow's names
 MODES = ("1", "L", "P", "LA", "RGB", "RGBA", "I;16", "I;16B")  # Pillow's modes whose values are read as they are
 LOSSY = ("jpeg", "tiff_jpeg", "webp")  # compressions of a TIFF
 RINGING = 32  # greatest error of a lossy format, codes
@@ -42,6 +45,7 @@ MOST_DIGITS = 7  # greatest number of 5-bit digits of a compressed run length: n
 LARGEST_LABEL = 32  # a PNG with a greater value, except 255, is a soft silhouette
 BACKGROUND = "background"  # CVAT's name of what has no label
 CHANGED = re.compile(r"^[0-9a-f]{8}-|\.rf\.[0-9a-f]{32}\.\w+$")  # what Label Studio and Roboflow add to a name
+SHAPES = ("polygon", "rectangle", "rotation", "mask")  # shapes of labelme and X-AnyLabeling that have an area
 CURE = "export the file again"
 log = logging.getLogger("factorlib.labels")
 SIMPLER = "draw outlines with fewer corners, or export the file again"
@@ -84,11 +88,13 @@ def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None)
     if picture.opaque is not None:
         return picture.opaque
     values = _values(picture, path, key)
-    return values > (LEFT_OUT if picture.lossy else values.max()) // 2  # in the values' own type, of which twice the greatest may be no number
+    return (
+        values > (LEFT_OUT if picture.lossy else values.max()) // 2
+    )  # in the values' own type, of which twice the greatest may be no number
 
 
 def read_labels_in(path: str | Path, key: str, size: tuple[int, int] | None = None) -> set[int]:
-    """Return the labels in a picture; none if it is a silhouette: transparency, 0 and 255 alone, or mostly bright greys.
+    """Return the labels in a picture; none if it is a silhouette: transparency, 0 and 255, or mostly bright greys.
 
     Args:
         path: File.
@@ -174,12 +180,12 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
         size = size or image.size[::-1]
         if sorted(image.size) != sorted(size):  # before anything is decoded
             check_size(image.size[::-1], size, path, key)
-        if (count := getattr(image, "n_frames", 1)) > 1:
-            raise InputError(f"holds {count} pictures", file=path, key=key, cure="save the mask alone, as PNG")
+        if getattr(image, "n_frames", 1) > 1 or image.mode in ("I", "F"):
+            fault = "holds several pictures, or values of 32 bits"
+            raise InputError(fault, file=path, key=key, cure="save one picture of 8 or 16 bits, as PNG")
         raw = re.search(r"\b(L|LA|RGB|RGBA);\d+", str(image.tile))
         lossy = image.format == "JPEG" or image.info.get("compression") in LOSSY
-        if image.format == "WEBP":
-            lossy = b"VP8L" not in Path(path).read_bytes()[: 1 << 16]
+        lossy |= image.format == "WEBP" and b"VP8L" not in Path(path).read_bytes()[: 1 << 16]
         ImageOps.exif_transpose(image, in_place=True)
         check_size(image.size[::-1], size, path, key)
         if image.mode not in MODES or (image.mode == "P" and image.format != "PNG"):  # others may reorder a palette
@@ -193,13 +199,13 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
 def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
     """Return the values of a decoded picture; if it is lossy, 0 and 255, which it must be near."""
     values = _values(picture, path, key)
-    if not picture.lossy:
-        return values
-    white = np.count_nonzero(values >= LEFT_OUT - RINGING)
-    if np.count_nonzero(values) > 0 and 2 * np.count_nonzero(values > RINGING) >= 3 * white:
-        cure = "save labels as PNG; or, if it shows one material, write masks: {material: file}"
-        raise InputError("is of a lossy format, which changes labels", file=path, key=key, cure=cure)
-    return np.where(values > LEFT_OUT // 2, LEFT_OUT, 0).astype(np.uint16)
+    if picture.lossy:
+        white = np.count_nonzero(values >= LEFT_OUT - RINGING)
+        if values.any() and 2 * np.count_nonzero(values > RINGING) >= 3 * white:
+            cure = "save labels as PNG; or, if it shows one material, write masks: {material: file}"
+            raise InputError("is of a lossy format, which changes labels", file=path, key=key, cure=cure)
+        values = np.where(values > LEFT_OUT // 2, LEFT_OUT, 0).astype(np.uint16)
+    return values
 
 
 def _values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
@@ -249,10 +255,18 @@ def check_size(size: Sequence[float], expected: Sequence[int], path: str | Path,
 
 
 class Rle(msgspec.Struct, frozen=True):
-    """Lengths of runs outside, inside, outside, … down the columns; a string is COCO's compressed form."""
+    """Lengths of runs outside, inside, outside, … down the columns; a string is COCO's compressed form.
 
-    size: tuple[int, int]  # height, width
-    counts: list[int] | str
+    Attributes:
+        size: height, width
+        mask: PNG of labelme, in place of runs
+        points: corners of its box
+    """
+
+    size: tuple[int, int] = (0, 0)
+    counts: list[int] | str = ""
+    mask: bytes | None = None
+    points: list[tuple[float, float]] = []
 
 
 class Annotation(msgspec.Struct, frozen=True):
@@ -264,10 +278,11 @@ class Annotation(msgspec.Struct, frozen=True):
 
 
 class Category(msgspec.Struct, frozen=True):
-    """Category of annotations; its name is that of a material."""
+    """Category of annotations; its name is that of a material. A supercategory may be a category itself."""
 
     id: int | str
     name: str
+    supercategory: Any = None
 
 
 class CocoImage(msgspec.Struct, frozen=True):
@@ -282,17 +297,25 @@ class CocoImage(msgspec.Struct, frozen=True):
 class Coco(msgspec.Struct, frozen=True):
     """Contents of a COCO file that are read; others are ignored."""
 
+    PLACE: ClassVar[str] = "annotations[{}].segmentation"
     images: list[CocoImage]
     annotations: list[Annotation]
     categories: list[Category]
 
 
+class _LabelmeCoco(Coco, frozen=True):
+    """Shapes of labelme as COCO's."""
+
+    PLACE: ClassVar[str] = "shapes[{}]"
+
+
 class LabelmeShape(msgspec.Struct, frozen=True):
-    """Shape of labelme: corners of a polygon, or opposite corners of a rectangle."""
+    """Shape of labelme: corners of a polygon, or opposite ones of a rectangle, or of the box of a mask, a PNG."""
 
     label: str
     points: list[tuple[float, float]]
-    shape_type: str = "polygon"
+    shape_type: Any = "polygon"
+    mask: bytes | None = None
 
 
 class Labelme(msgspec.Struct, frozen=True):
@@ -316,22 +339,39 @@ def read_annotations(path: str | Path, image: str = "", key: str | None = None) 
         try:
             labelme = msgspec.json.decode(content, type=Labelme)
         except msgspec.ValidationError:
+            if b'"annotations"' not in content and b'"shapes"' in content:
+                raise
             return msgspec.json.decode(content, type=Coco)
         images = [CocoImage(0, image, labelme.imageWidth, labelme.imageHeight)]
         names = dict.fromkeys(shape.label for shape in labelme.shapes)
+        for k, kind in enumerate(shape.shape_type for shape in labelme.shapes):
+            if kind not in SHAPES:
+                fault = f"{one_line(repr(kind))} is not read, but {', '.join(SHAPES)} are"
+                raise InputError(fault, file=path, key=f"shapes[{k}].shape_type", cure="draw its outline, or delete it")
         annotations = [Annotation(0, shape.label, msgspec.Raw(_segmentation(shape))) for shape in labelme.shapes]
-        return Coco(images, annotations, [Category(name, name) for name in names])
+        return _LabelmeCoco(images, annotations, [Category(name, name) for name in names])
 
 
 def _segmentation(shape: LabelmeShape) -> bytes:
-    """Return COCO's text of a shape; null for one that is neither a polygon nor a rectangle."""
+    """Return COCO's text of a shape, whose pixels, if it is a mask, stay a PNG until its photo is read."""
+    if shape.shape_type == "mask":
+        return msgspec.json.encode(Rle(mask=shape.mask or b"", points=shape.points))
     points = np.array(shape.points)
-    if shape.shape_type == "rectangle":
-        (left, top), (right, bottom) = points.tolist()
+    if shape.shape_type == "rectangle":  # two opposite corners, or all four
+        (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
         points = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-    elif shape.shape_type != "polygon":
-        return b"null"
     return msgspec.json.encode([points.ravel().tolist()])
+
+
+def _runs_of_mask(shape: Rle, size: tuple[int, int], path: str | Path, key: str) -> str:
+    """Return the run lengths of a mask of labelme in a picture of a size."""
+    inside = np.zeros(size, np.uint8, order="F")
+    with reading("a mask", path, key, CURE), Image.open(BytesIO(shape.mask or b""), formats=["PNG"]) as image:
+        left, top = np.round(shape.points[0]).astype(int)
+        if min(left, top) < 0 or image.width > size[1] - left or image.height > size[0] - top:
+            raise ValueError(f"its {image.width} × {image.height} pixels at ({left}, {top}) leave the photo")
+        inside[top : top + image.height, left : left + image.width] = np.asarray(image.convert("L")) > 0
+    return pycocomask.encode(inside)["counts"].decode("ascii")
 
 
 def read_coco(
@@ -357,15 +397,19 @@ def read_coco(
     for index, annotation in enumerate(coco.annotations):
         if annotation.image_id != entry.id:
             continue
-        place = f"annotations[{index}]"
+        place = coco.PLACE.format(index)
         name = names.get(annotation.category_id)
         if name is None:
             fault = f"category_id is {annotation.category_id!r}, but categories has no such id"
-            raise InputError(fault, file=path, key=place, cure="add the category, or correct category_id")
+            raise InputError(
+                fault, file=path, key=f"annotations[{index}]", cure="add the category, or correct category_id"
+            )
         if name not in materials:
             cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
-            raise InputError(f"category {name!r} is not a material", file=path, key=place, cure=cure)
-        segmentations.setdefault(name, []).append((f"{place}.segmentation", annotation.segmentation))
+            raise InputError(
+                f"category {name!r} is not a material", file=path, key=place.removesuffix(".segmentation"), cure=cure
+            )
+        segmentations.setdefault(name, []).append((place, annotation.segmentation))
     masks = {}
     length = 0.0  # of all outlines
     for name, entries in segmentations.items():
@@ -439,15 +483,20 @@ def run_lengths(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
 
 def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
     """Return the image entry of the same path, or else of the same file name."""
-    base = PurePosixPath(image).name
-    bases = [PurePosixPath(entry.file_name.replace("\\", "/")).name for entry in coco.images]
-    entries = [entry for entry in coco.images if PurePosixPath(entry.file_name) == PurePosixPath(image)]
-    entries = entries or [entry for entry, name in zip(coco.images, bases) if name == base]
+    place = plain_path(image)
+    base = place.name
+    places = [plain_path(entry.file_name) for entry in coco.images]
+    same = [path for path in places if path == place] or [path for path in places if path.name == base]
     plain = base.replace(".", "_")  # Roboflow's kitchen_jpg.rf.<digits>.jpg
-    entries = entries or [entry for entry, name in zip(coco.images, bases) if CHANGED.sub("", name) in (base, plain)]
+    same = same or [path for path in places if CHANGED.sub("", path.name) in (base, plain)]
+    nearest = nearest_paths(place, same)
+    entries = [entry for entry, path in zip(coco.images, places) if path in nearest]
     if not entries:
         raise InputError(
-            f"the COCO file has no image {base!r}", file=path, key="images", cure=did_you_mean(base, bases)
+            f"the COCO file has no image {base!r}",
+            file=path,
+            key="images",
+            cure=did_you_mean(base, [path.name for path in places]),
         )
     if len(entries) > 1:
         raise InputError(
@@ -468,6 +517,8 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
             "is empty: the annotation has only a box", file=path, key=key, cure="draw its outline, or delete it"
         )
     if isinstance(segmentation, Rle):
+        if segmentation.mask is not None:
+            return [_runs_of_mask(segmentation, shape, path, key)], 0.0
         if tuple(segmentation.size) != shape:
             raise InputError(
                 f"its RLE is {segmentation.size[1]} × {segmentation.size[0]} pixels, the image {shape[1]} × {shape[0]}",

@@ -2,24 +2,36 @@
 
 Cameras are a NeRF-style transforms.json or a COLMAP model; the photos are then those that it names.  Else they are the
 images of the folder, or, if it has none, those of its subfolders.  A mask is the image that transforms.json names as
-`mask_path`, `<photo>_mask.png` (Metashape), `<photo>.<suffix>.png` (COLMAP), or an image in a folder `mask…`.
+`mask_path`, `<photo>_mask.png` (Metashape), `<photo>.<suffix>.png` (COLMAP), or an image in a folder `mask…`.  It
+belongs to the photo of the same name that shares the most folders with it.  Maps of depth and confidence, thumbnails,
+and copies at a smaller size (`images_2` beside `images`) are no photos.
 """
 
-from collections.abc import Iterable
+import os
+import re
+from collections import Counter
+from collections.abc import Container, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import msgspec
 
-from factorlib.dataset.check import IMAGES
-from factorlib.dataset.paths import Refusal
+from factorlib.dataset.check import IMAGES, MASK_IMAGES
+from factorlib.dataset.paths import Refusal, nearest_paths, plain_path
 from factorlib.dataset.sources.colmap import read_colmap
 from factorlib.dataset.sources.source_image import MOST_BYTES
+from factorlib.errors import InputError
 from factorlib.reading import read_bytes, reading
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 MODELS = tuple((f"cameras{suffix}", f"images{suffix}") for suffix in (".bin", ".txt"))
-SUFFIXES = (*IMAGES, ".json", ".bin", ".txt")  # suffixes of the files that are examined
+PICTURES = (*IMAGES, *MASK_IMAGES)
+AUXILIARY = re.compile(
+    r"(depth|confidence|normal|thumb(nail)?)s?([_-]?maps?)?(_\d+)?", re.IGNORECASE
+)  # names, no photos
+MASK_FOLDER = re.compile(r"(^|[_ -])(mask|msk|segmentation|silhouette)", re.IGNORECASE)
+DOWNSAMPLED = re.compile(r"^((?:image|mask)s?)_\d+$")  # folders of copies, as NeRF's programs write them
+SUFFIXES = (*PICTURES, ".json", ".bin", ".txt")  # suffixes of the files that are examined
 
 
 class Cameras(msgspec.Struct):
@@ -42,56 +54,105 @@ class Cameras(msgspec.Struct):
     revolved: bool = False
 
 
-def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict[str, Path], Cameras | None]:
+def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict[Path, Path], Cameras | None]:
     """Sort the files of a folder and its subfolders.
 
     Returns:
-        The photos, their masks by the stems of their names, and their cameras, if files give these.
+        The photos, the mask of each that has one, and their cameras, if files give these.
+
+    Raises:
+        InputError: A mask may be that of several photos, a photo has several masks, or a named mask does not exist.
     """
-    pictures = [path for path in files if path.suffix.lower() in IMAGES]
-    stems = {path.stem for path in pictures}
-    masks = {stem: path for path in pictures if (stem := _masked_stem(path.relative_to(folder), stems))}
-    images = sorted(set(pictures).difference(masks.values()))
-    cameras, names = _cameras(folder, files)
-    if cameras:
-        named = {folder_and_stem(name)[1]: cameras.files[0].parent / str(mask) for name, mask in names.items()}
-        masks |= {stem: path for stem, path in named.items() if path in files}
-        images = _named_images(images, names) or images
-    else:
-        images = [path for path in images if path.parent == folder] or images
-    return images, masks, cameras
+    places = {plain_path(path.relative_to(folder)): path for path in files if path.suffix.lower() in PICTURES}
+    places = {p: places[p] for p in places if not any(map(AUXILIARY.fullmatch, (*p.parent.parts, p.stem)))}
+    folders = {above for place in places for above in place.parents}
+    full = {p for p in places if not any(_is_copy(above, folders) for above in p.parents if above.name)}
+    stems = {stem_of(place) for place in places}
+    cameras, frames = _cameras(folder, files)
+    masks = {place: stem for place in places if (stem := _masked_stem(place, stems))}
+    named_masks = {*frames.values()}
+    photos = {p: stem_of(p) for p in places if p.suffix.lower() in IMAGES and p not in masks and p not in named_masks}
+    # the images that cameras name, of several copies the largest; else those at the top, or in subfolders
+    pairs = _namesakes({name: stem_of(name) for name in frames}, photos)
+    named = dict(sorted(pairs, key=lambda pair: (pair[1] in full, places[pair[1]].stat().st_size)))
+    images = [*named.values()] or [p for p in photos if p in full and not p.parent.name] or full.intersection(photos)
+    # masks that transforms.json names, or that are called as a photo
+    paired = {image: mask for name, image in named.items() if (mask := frames[name]) in places}
+    pairs = _namesakes({p: photos[p] for p in images if p not in paired}, {p: masks[p] for p in masks if p in full})
+    times = Counter(path for pair in pairs for path in pair)
+    for photo, mask in pairs:
+        if times[photo] > 1 or times[mask] > 1:
+            fault = f"it is not clear whether it is the mask of {photo}: there are others of this name"
+            cure = "put masks into subfolders as the photos are, masks/<folder>/<photo>.png, one for each photo"
+            raise InputError(fault, file=folder / mask, key="PHOTOS", cure=cure)
+    paired |= dict(pairs)
+    if gone := [name for name, image in named.items() if frames[name] and image not in paired]:
+        fault = f"there is no picture '{frames[gone[0]]}'"
+        key = f"mask_path of {gone[0]}"
+        raise InputError(fault, file=cameras and cameras.files[0], key=key, cure="put it there, or delete the key")
+    return sorted(places[p] for p in images), {places[p]: places[mask] for p, mask in paired.items()}, cameras
 
 
-def folder_and_stem(name: str) -> tuple[str, str]:
-    """Return the folder in a file's path, and its name without the suffix of an image; "r_0.5" has none.
+def stem_of(path: PurePosixPath) -> str:
+    """Return the name of a file without the suffix of an image; "r_0.5" has none.
 
-    >>> folder_and_stem("./train/r_0.5"), folder_and_stem("0001.png")
-    (('train', 'r_0.5'), ('', '0001'))
+    >>> stem_of(PurePosixPath("./train/r_0.5")), stem_of(PurePosixPath("0001.png"))
+    ('r_0.5', '0001')
     """
-    path = PurePosixPath(name)
-    return path.parent.name, path.stem if path.suffix.lower() in IMAGES else path.name
+    return path.stem if path.suffix.lower() in PICTURES else path.name
 
 
-def _masked_stem(path: Path, stems: set[str]) -> str | None:
+def _is_copy(folder: PurePosixPath, folders: Container[PurePosixPath]) -> bool:
+    """Return True for a folder beside that of the same pictures at full size, or with the lens's distortion removed."""
+    better = DOWNSAMPLED.sub(r"\1", folder.name), f"corrected_{folder.name}"
+    return any(name != folder.name and folder.with_name(name) in folders for name in better)
+
+
+def _masked_stem(place: PurePosixPath, stems: set[str]) -> str | None:
     """Return the stem of the photo whose mask an image is; None if it is a photo."""
-    stem = path.stem.removesuffix("_mask")
-    inner = folder_and_stem(stem)[1]
-    named = inner in stems and inner != path.stem
-    in_folder = any(part.lower().startswith("mask") for part in path.parts[:-1])
-    return inner if in_folder or (named and path.suffix.lower() == ".png") else None
+    inner = stem_of(PurePosixPath(place.stem.removesuffix("_mask")))
+    in_folder = any(map(MASK_FOLDER.search, place.parent.parts))
+    return inner if in_folder or (inner in stems and inner != place.stem) else None
 
 
-def _cameras(folder: Path, files: list[Path]) -> tuple[Cameras | None, dict[str, Any]]:
-    """Return the cameras in a folder, and the image names in them, each with its mask; the source nearest to the top.
+def _namesakes(
+    ones: Mapping[PurePosixPath, str], others: Mapping[PurePosixPath, str]
+) -> list[tuple[PurePosixPath, PurePosixPath]]:
+    """Return the pairs of paths of the same stem of which neither shares more folders with another path.
+
+    Args:
+        ones: stems by path
+        others: stems by path
+    """
+    by_stem: dict[str, tuple[list, list]] = {}
+    for side, paths in enumerate((ones, others)):
+        for path, stem in paths.items():
+            by_stem.setdefault(stem, ([], []))[side].append(path)
+    return [
+        (one, other)
+        for left, right in by_stem.values()
+        for one in left
+        for other in nearest_paths(one, right)
+        if one in nearest_paths(other, left)
+    ]
+
+
+def _cameras(folder: Path, files: list[Path]) -> tuple[Cameras | None, dict[PurePosixPath, PurePosixPath | None]]:
+    """Return the cameras in a folder, and the names of images in them, each with the place of its mask or None.
+
+    The source is that nearest to the top.
 
     Of several COLMAP models it is the largest one.
     """
     if transforms := sorted((path for path in files if path.name in TRANSFORMS), key=lambda path: len(path.parts)):
         with reading("transforms.json", transforms[0], "PHOTOS"):
             frames = msgspec.json.decode(read_bytes(transforms[0], "JSON", most_bytes=MOST_BYTES))["frames"]
-            names = {str(frame["file_path"]): frame.get("mask_path") for frame in frames}
-        place = transforms[0].relative_to(folder).as_posix()
-        return Cameras({"transforms": f"cameras/{place}"}, folder, transforms[:1]), names
+            masks = {plain_path(frame["file_path"]): frame.get("mask_path") for frame in frames}
+        place = transforms[0].relative_to(folder)
+        names = {
+            name: mask and plain_path(os.path.normpath(place.parent / plain_path(mask))) for name, mask in masks.items()
+        }
+        return Cameras({"transforms": f"cameras/{place.as_posix()}"}, folder, transforms[:1]), names
     pairs = [[path.with_name(camera), path] for camera, image in MODELS for path in files if path.name == image]
     models = [pair for pair in pairs if pair[0] in files]
     if not models:
@@ -99,13 +160,6 @@ def _cameras(folder: Path, files: list[Path]) -> tuple[Cameras | None, dict[str,
     model = max(models, key=lambda pair: pair[1].stat().st_size)
     place = model[0].parent.relative_to(folder).as_posix()
     images = read_colmap(place, Refusal(model[1], folder))
-    return Cameras({"colmap": f"cameras/{place}"}, folder, model), {str(image.name): None for image in images}
-
-
-def _named_images(images: list[Path], names: Iterable[str]) -> list[Path]:
-    """Return the images that a source of cameras names, each from the largest file if it names no folders."""
-    wanted = {folder_and_stem(name) for name in names}
-    exact = [path for path in images if folder_and_stem(str(path)) in wanted]
-    stems = {stem for _, stem in wanted}
-    by_size = sorted((path for path in images if path.stem in stems), key=lambda path: path.stat().st_size)
-    return exact or sorted({path.stem: path for path in by_size}.values())
+    return Cameras({"colmap": f"cameras/{place}"}, folder, model), {
+        plain_path(str(image.name)): None for image in images
+    }

@@ -135,8 +135,7 @@ def _text_images(file: Path) -> Iterator[ImageLine]:
                 continue
             words = line.strip().split(maxsplit=9)
             if len(words) != 10:
-                fault = f"line {number}, {one_line(line)!r}, has {len(words)} words"
-                raise ValueError(f"{fault}; the line of an image has 10")
+                raise ValueError(f"line {number}: {one_line(line)!r} has {len(words)} words; that of an image has 10")
             has_points = True
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
