@@ -45,7 +45,7 @@ from factorlib.labels.mask_files import (
 )
 from factorlib.meshes.read_mesh import read_mesh, read_parts
 from factorlib.onboarding.matte import opaque_pixels
-from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder
+from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder, stem_of_mask
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
 
@@ -63,7 +63,6 @@ LABELMAP = "labelmap.txt"  # names of the colours in CVAT's masks
 SIDE = 400  # longest side of a silhouette for pairing, pixels
 BESIDE = "\x1f"  # separates a value from the comment beside it
 HULL = "thing"  # name of the mesh if none is given
-WHOLE = {"mask", *(suffix[1:] for suffix in IMAGES)}  # endings of masks of all of an object: Metashape's, COLMAP's
 NO_MESH = (
     "there is no mesh: `hull: true` and `cameras: {sfm: true}` are written, which need photos that overlap, "
     "each 10 to 20° from the next; "
@@ -349,12 +348,12 @@ def _annotated_materials(path: Path, file: str, missing: list[str]) -> list[str]
 
 
 def _tails(place: PurePosixPath) -> list[str]:
-    """Return the words of a path without its suffix, with all of its folders, then with fewer.
+    """Return the words of a path, by the stem of its photo, with all of its folders, then with fewer.
 
     >>> _tails(PurePosixPath("rig/front/0001.png"))
     ['rig_front_0001', 'front_0001', '0001']
     """
-    parts = place.with_suffix("").parts
+    parts = *place.parent.parts, stem_of_mask(place)
     return [_word("_".join(parts[k:])) for k in range(len(parts))]
 
 
@@ -378,15 +377,12 @@ def _masks_by_photo(
     further: dict[str, dict[str, Path]] = {}
     for path, words in tails.items():
         words = words[: max(1, len(words) - 1)]  # not the name without any of its folders
-        if photo := next(
-            (names[word] for word in words if word in names), None
-        ):  # Even kitchen_2.png may be one's name.
+        if photo := next((names[word] for word in words if word in names), None):  # may be kitchen_2's
             whole.setdefault(photo, path)
             continue
-        for word, cut in [(word, cut) for word in words for cut, letter in enumerate(word) if letter == "_"]:
+        for word, cut in [(each, k) for each in words for k, letter in enumerate(each) if letter == "_"]:
             if photo := names.get(word[:cut]):
-                material = word[cut + 1 :]
-                further.setdefault(photo, {})[HULL if material.lower() in WHOLE else material] = path
+                further.setdefault(photo, {})[word[cut + 1 :]] = path
     return whole, further
 
 

@@ -21,7 +21,7 @@ from factorlib.evaluate.truth import read_true_albedo, read_true_light, read_tru
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
-from factorlib.labels.label_image import check_materials, read_labels, read_object_indices
+from factorlib.labels.label_image import check_materials, read_labels, read_object_indices, warn_of_strays
 from factorlib.meshes.read_mesh import part_labels, read_mesh, read_parts
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.recipe.kinds import is_light_file
@@ -149,11 +149,12 @@ class Validation:
         check_values(path, most_megapixels, f"{key}.image")
         self._pixels.append(partial(opened.check_pixels, path, f"{key}.image"))
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
+        file = self.file(entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values())))
+        warn_of_strays(labels.label > 0, file, f"{key}.masks")
         object_masks = [(obj.name, obj.mask) for obj in entry.objects]
         objects = read_object_indices(object_masks, self.file, size, f"{key}.objects")
         object_materials = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
-        masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
-        check_materials(labels, objects, object_materials, self.spec.materials, self.file(masks), f"{key}.objects")
+        check_materials(labels, objects, object_materials, self.spec.materials, file, f"{key}.objects")
 
     def _object(self, obj: MeshInstance, relative: str, limits: Limits) -> None:
         """Check the parts of a mesh file, which is read once; a failure is raised again for every object."""

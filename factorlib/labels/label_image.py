@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy import ndimage
 
 from factorlib.dataset.paths import labelmap_beside
 from factorlib.dataset.schema import LEFT_OUT
@@ -20,6 +21,10 @@ from factorlib.labels.mask_files import read_coco, read_colours, read_inside, re
 
 MUCH = 0.1  # share of an object's pixels that is more than a slip of the brush
 DRAWN_EDGE = 2  # width of the pixels that adjacent outlines may share; they are left out without an error
+STRAY_SHARE = 0.01  # area of a piece, as a share of the largest one's, below which it is a speck
+STRAY_GAP = 0.1  # distance between pieces, in extents of the largest one, above which they are parts of different things
+STRAY_CELLS = 512  # greatest number of cells along a side, on which pieces are sought
+MOST_STRAYS = 5  # pieces that a warning names
 log = logging.getLogger("factorlib.labels")
 
 
@@ -167,6 +172,33 @@ def check_materials(
             names = ", ".join(sorted(expected))
             cure = f"correct the materials in dataset.yaml (there {names}), or the labels of the mask"
             raise InputError(fault, file=path, key=f"{key}[{members[0]}].materials", cure=cure)
+
+
+def warn_of_strays(inside: Bool[np.ndarray, "h w"], path: Path, key: str) -> None:
+    """Name small pieces of a mask far from its largest one in a warning: specks are no part of the thing.
+
+    Args:
+        inside: The mask.
+        path: File to name.
+        key: Key to name.
+    """
+    # number of pixels of the mask in each cell, and the extent of the largest piece of touching cells
+    cell = -(-max(inside.shape) // STRAY_CELLS)
+    rows, columns = (np.arange(0, length, cell) for length in inside.shape)
+    counts = np.add.reduceat(np.add.reduceat(inside, rows, axis=0, dtype=np.uint16), columns, axis=1, dtype=np.int64)
+    pieces, _ = ndimage.label(counts, np.ones((3, 3)))
+    largest = pieces == np.bincount(pieces.ravel(), counts.ravel()).argmax()
+    reach = STRAY_GAP * (np.ptp(np.argwhere(largest), axis=0).max() + 1)
+    # groups of pieces nearer to each other than STRAY_GAP extents; 0 is the background
+    groups, _ = ndimage.label(ndimage.distance_transform_edt(counts == 0) <= reach / 2)
+    areas = np.bincount(groups.ravel(), counts.ravel())
+    strays = np.flatnonzero((areas < STRAY_SHARE * areas.max()) & (areas > 0))
+    if len(strays):
+        centres = np.multiply(ndimage.center_of_mass(counts, groups, strays), cell).round().astype(int).tolist()
+        named = [f"{areas[k]:.0f} px at ({x}, {y})" for k, (y, x) in zip(strays, centres)]
+        more = ", …" * (len(named) > MOST_STRAYS)
+        text = "%s: %s: %d small pieces lie far from the thing: %s: erase them if they are no part of it"
+        log.warning(text, path, key, len(named), ", ".join(named[:MOST_STRAYS]) + more)
 
 
 def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:

@@ -69,7 +69,7 @@ def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict
     full = {p for p in places if not any(_is_copy(above, folders) for above in p.parents if above.name)}
     stems = {stem_of(place) for place in places}
     cameras, frames = _cameras(folder, files)
-    masks = {place: stem for place in places if (stem := _masked_stem(place, stems))}
+    masks = {p: stem_of_mask(p) for p in places if _is_mask(p, stems)}
     named_masks = {*frames.values()}
     photos = {p: stem_of(p) for p in places if p.suffix.lower() in IMAGES and p not in masks and p not in named_masks}
     # the images that cameras name, of several copies the largest; else those at the top, or in subfolders
@@ -108,11 +108,15 @@ def _is_copy(folder: PurePosixPath, folders: Container[PurePosixPath]) -> bool:
     return any(name != folder.name and folder.with_name(name) in folders for name in better)
 
 
-def _masked_stem(place: PurePosixPath, stems: set[str]) -> str | None:
-    """Return the stem of the photo whose mask an image is; None if it is a photo."""
-    inner = stem_of(PurePosixPath(place.stem.removesuffix("_mask")))
-    in_folder = any(map(MASK_FOLDER.search, place.parent.parts))
-    return inner if in_folder or (inner in stems and inner != place.stem) else None
+def stem_of_mask(path: PurePosixPath) -> str:
+    """Return the stem of the photo whose mask a file is: of 0001.jpg.png and 0001_mask.png it is 0001."""
+    return stem_of(PurePosixPath(re.sub("(?i)[_.-]mask$", "", path.stem)))
+
+
+def _is_mask(place: PurePosixPath, stems: set[str]) -> bool:
+    """Return True for an image in a folder of masks, and for one that is called as the mask of another."""
+    stem = stem_of_mask(place)
+    return any(map(MASK_FOLDER.search, place.parent.parts)) or (stem in stems and stem != stem_of(place))
 
 
 def _namesakes(
