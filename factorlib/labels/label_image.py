@@ -22,7 +22,9 @@ from factorlib.labels.mask_files import read_coco, read_colours, read_inside, re
 MUCH = 0.1  # share of an object's pixels that is more than a slip of the brush
 DRAWN_EDGE = 2  # width of the pixels that adjacent outlines may share; they are left out without an error
 STRAY_SHARE = 0.01  # area of a piece, as a share of the largest one's, below which it is a speck
-STRAY_GAP = 0.1  # distance between pieces, in extents of the largest one, above which they are parts of different things
+STRAY_GAP = (
+    0.1  # distance between pieces, in extents of the largest one, above which they are parts of different things
+)
 STRAY_CELLS = 512  # greatest number of cells along a side, on which pieces are sought
 MOST_STRAYS = 5  # pieces that a warning names
 log = logging.getLogger("factorlib.labels")

@@ -35,6 +35,7 @@ FORMATS = ["PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "TGA"]  # Pillow's names
 MODES = ("1", "L", "P", "LA", "RGB", "RGBA", "I;16", "I;16B")  # Pillow's modes whose values are read as they are
 LOSSY = ("jpeg", "tiff_jpeg", "webp")  # compressions of a TIFF
 RINGING = 32  # greatest error of a lossy format, codes
+MOST_SOFT = 0.25  # greatest share of pixels between black and white in a lossy silhouette, of the white ones
 _STRETCH = {"L;2": 85, "L;4": 17}  # code of 1 after grey of so many bits is stretched to 8
 Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; a mask has the size of its photo, which is limited
 OVERSHOOT = 2.0  # a polygon may leave the image by this many pixels
@@ -201,7 +202,7 @@ def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.nd
     values = _values(picture, path, key)
     if picture.lossy:
         white = np.count_nonzero(values >= LEFT_OUT - RINGING)
-        if values.any() and 2 * np.count_nonzero(values > RINGING) >= 3 * white:
+        if values.any() and np.count_nonzero(values > RINGING) >= (1 + MOST_SOFT) * white:
             cure = "save labels as PNG; or, if it shows one material, write masks: {material: file}"
             raise InputError("is of a lossy format, which changes labels", file=path, key=key, cure=cure)
         values = np.where(values > LEFT_OUT // 2, LEFT_OUT, 0).astype(np.uint16)

@@ -1,5 +1,6 @@
 """Masks: every way to give one means the same labels, and what is doubtful is refused by name; labels grown from strokes."""
 
+import base64
 import json
 from itertools import groupby
 
@@ -8,8 +9,9 @@ import pytest
 from PIL import Image
 from pycocotools import mask as pycocomask
 
+from factorlib.images.picture import png_bytes
 from factorlib.labels.grow import grow
-from factorlib.labels.label_image import Labels, check_materials, read_labels, read_object_indices
+from factorlib.labels.label_image import Labels, check_materials, read_labels, read_object_indices, warn_of_strays
 from factorlib.labels.mask_files import read_labels_in, read_values, run_lengths
 from tests.refusal import refusal
 
@@ -21,20 +23,13 @@ LABEL[10:18, 5:25] = 3
 KEY = "photos[kitchen].masks"
 
 
-def save(path, values, mode=None):
-    Image.fromarray(values).save(path) if mode is None else Image.fromarray(values).convert(mode).save(path)
+def save(path, values, **options):
+    Image.fromarray(values).save(path, **options)
     return path.name
 
 
 def labels(folder, masks, size=(H, W), image="photos/kitchen.jpg", materials=MATERIALS):
     return read_labels(masks, lambda name: folder / name, materials, size, image, KEY)
-
-
-def refused(folder, masks, **options):
-    """The message with which `masks` are refused; it always names file and key, and a cure."""
-    error = refusal(".", labels, folder, masks, **options)
-    assert str(folder) in str(error.file) and error.key
-    return str(error)
 
 
 def palette(path, values):
@@ -76,8 +71,12 @@ def box(x0, y0, x1, y1):
 
 
 def labelme(folder, shapes, size=(H, W)):
-    """shapes: (label, points, shape_type)."""
-    shapes = [{"label": name, "points": points, "shape_type": kind, "group_id": None} for name, points, kind in shapes]
+    """shapes: (label, points, shape_type); a mask has the pixels of LABEL in its box."""
+    shapes = [{"label": name, "points": points, "shape_type": kind, "mask": None} for name, points, kind in shapes]
+    for shape in (shape for shape in shapes if shape["shape_type"] == "mask"):
+        (left, top), (right, bottom) = shape["points"]
+        inside = np.pad(LABEL, (0, 9))[top : bottom + 1, left : right + 1] == MATERIALS.index(shape["label"]) + 1
+        shape["mask"] = base64.b64encode(png_bytes(255 * inside[..., None].astype(np.uint8))).decode()
     content = {"version": "5", "shapes": shapes, "imagePath": "a.jpg", "imageHeight": size[0], "imageWidth": size[1]}
     (folder / "labelme.json").write_text(json.dumps(content))
     return "labelme.json"
@@ -107,6 +106,7 @@ def quantized(path, inside):
 
 
 RED, WOOD = LABEL == 1, LABEL == 3
+TURNED = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06" + bytes(6)  # to be turned clockwise
 FORMS = {
     "grey": lambda at: save(at / "a.png", LABEL),
     "palette": lambda at: palette(at / "a.png", LABEL),
@@ -122,6 +122,15 @@ FORMS = {
     "opaque everywhere": lambda at: {"red": save(at / "r.png", np.dstack([RED * np.uint8(255)] * 3 + [np.full_like(LABEL, 254)])), "wood": save(at / "w.png", WOOD)},
     "colours": lambda at: cvat(at, "RGB"),
     "colours of a palette": lambda at: cvat(at, "P"),
+    "TIFF": lambda at: save(at / "a.tif", LABEL),
+    "BMP": lambda at: save(at / "a.bmp", LABEL),
+    "TGA": lambda at: save(at / "a.tga", LABEL),
+    "GIF, whose palette has other numbers": lambda at: save(at / "a.gif", LABEL),
+    "WebP": lambda at: save(at / "a.webp", np.dstack([LABEL] * 3), lossless=True),
+    "one each, JPEG": lambda at: {"red": save(at / "r.jpg", RED * np.uint8(255), quality=90), "wood": save(at / "w.jpg", np.dstack([WOOD * np.uint8(255)] * 3), quality=90)},
+    "one each, lossy": lambda at: {"red": save(at / "r.webp", np.dstack([RED * np.uint8(255)] * 3), quality=95), "wood": save(at / "w.tif", WOOD * np.uint8(255), compression="jpeg")},
+    "one each, turned": lambda at: {"red": save(at / "r.jpg", np.rot90(RED) * np.uint8(255), exif=TURNED), "wood": save(at / "w.tif", WOOD)},
+    "pixels of labelme": lambda at: labelme(at, [("red", [[0, 0], [20, 10]], "mask"), ("wood", [[5, 10], [25, 10], [25, 18], [5, 18]], "rectangle")]),
     "labelme": lambda at: labelme(at, [("red", [[3, 2], [12, 9]], "rectangle"), ("wood", [[5, 10], [25, 10], [25, 18], [5, 18]], "polygon")]),
     "stored size": lambda at: coco(at, [(10, [box(3, 2, 12, 9)]), (12, [box(5, 10, 25, 18)])], [{"id": 7, "file_name": "kitchen.jpg", "width": H, "height": W}]),
     "flat polygon": lambda at: coco(at, [(12, [box(5, 10, 25, 18), [1, 1, 1, 5]]), (10, [box(3, 2, 12, 9)])], [{"id": 7, "file_name": "kitchen.jpg", "width": 30.0, "height": 20.0}]),
@@ -170,32 +179,58 @@ def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():
     assert len(run_lengths("10" * 500_000, 1 + 499_999 * 500_000 // 2)) == 1_000_000
 
 
-def test_masks_that_are_empty_or_overlap(tmp_path):
-    name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
-    for masks in ({"red": name, "wood": name}, coco(tmp_path, [])):
-        message = refused(tmp_path, masks)
-        assert "the mask is empty" in message and KEY in message
-    masks = {"wood": save(tmp_path / "w.png", np.uint8(255) * (LABEL > 0)), "red": save(tmp_path / "r.png", RED)}
-    message = refused(tmp_path, masks)
-    assert f"'red' and 'wood' share {RED.sum()} pixels" in message and "w.png" in message and "r.png" in message
+def pictured(*names):
+    """A COCO file of a shape in the first of such pictures."""
+    images = [{"id": 7 + k, "file_name": name} for k, name in enumerate(names)]
+    return lambda at: coco(at, [(10, [box(3, 2, 12, 9)])], images)
 
 
-def test_an_outline_within_another_is_in_front_of_it_and_shapes_without_an_outline_are_refused(tmp_path, caplog):
+BLACK, WHITE = np.zeros((H, W), np.uint8), np.full((H, W), 255, np.uint8)
+REFUSED = {
+    r"a\.png: photos\[kitchen\]\.masks: the mask is empty: no": lambda at: dict.fromkeys(("red", "wood"), save(at / "a.png", BLACK)),
+    r"coco\.json: photos\[kitchen\]\.masks: the mask is empty": lambda at: coco(at, []),
+    r"w\.png: .*'red' and 'wood' share 63 pixels with r\.png": lambda at: {"wood": save(at / "w.png", np.uint8(255) * (LABEL > 0)), "red": save(at / "r.png", RED)},
+    r"share 9 pixels": lambda at: coco(at, [(10, [box(12, 12, 15, 15)]), (12, [box(12, 12, 15, 15)])]),
+    r"shapes\[0\]\.shape_type: 'line' is not read.*\n.*draw its outline": lambda at: labelme(at, [("red", [[1, 1], [9, 9]], "line")]),
+    r"shapes\[1\]: .*leave the photo": lambda at: labelme(at, [("red", [[3, 2], [12, 9]], "rectangle"), ("wood", [[25, 10], [35, 18]], "mask")]),
+    r"shapes\[0\]: category 'rde' .*\n.*did you mean 'red'": lambda at: labelme(at, [("rde", [[3, 2], [12, 9]], "rectangle")]),
+    r"is of a lossy format.*\n.*as PNG; or": lambda at: save(at / "a.jpg", LABEL),
+    r"is of a lossy format": lambda at: save(at / "a.webp", np.dstack([LABEL * np.uint8(80)] * 3), quality=90),
+    r"holds only 0 and 255": lambda at: save(at / "a.jpg", RED * np.uint8(255)),
+    r"is a colour picture": lambda at: {"red": save(at / "a.jpg", np.dstack([WHITE, BLACK, BLACK]))},
+    r"the mask is 20 × 30 pixels.*\n.*EXIF": lambda at: {"red": save(at / "a.jpg", WHITE, exif=TURNED)},
+    r"holds several pictures": lambda at: {"red": save(at / "a.gif", WHITE, save_all=True, append_images=[Image.fromarray(BLACK)])},
+    r"32 bits": lambda at: save(at / "a.tif", LABEL.astype(np.float32)),
+    r"has 2 images 'kitchen\.jpg'": pictured("a/kitchen.jpg", "b/kitchen.jpg"),
+    r"did you mean 'kitchem\.jpg'": pictured("kitchem.jpg"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_is_no_mask_is_refused(tmp_path, words):
+    error = refusal(words, labels, tmp_path, REFUSED[words](tmp_path))
+    assert str(tmp_path) in str(error.file) and error.key
+
+
+def test_specks_far_from_the_thing_are_named(tmp_path, caplog):
+    mask = np.kron(LABEL == 3, np.ones((40, 40), bool))
+    mask[20:30, 20:22] = mask[730:740, 1050:1052] = True  # far, and near
+    warn_of_strays(mask, tmp_path, KEY)
+    assert "1 small pieces lie far from the thing: 20 px at (20, 23)" in caplog.text
+
+
+def test_an_outline_within_another_is_in_front_of_it(tmp_path, caplog):
     result = labels(tmp_path, coco(tmp_path, [(10, [box(12, 12, 15, 15)]), (12, [box(5, 10, 25, 18)])]))
     assert (result.label == 1).sum() == 9 and (result.label == 3).sum() == 151 and "'red' is in front" in caplog.text
-    same = coco(tmp_path, [(10, [box(12, 12, 15, 15)]), (12, [box(12, 12, 15, 15)])])
-    assert "share 9 pixels" in refused(tmp_path, same)
-    assert "draw its outline" in refused(tmp_path, labelme(tmp_path, [("red", [[1, 1], [9, 9]], "line")]))
 
 
-def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
-    images = lambda *names: [{"id": 6 + k, "file_name": f"{name}.jpg"} for k, name in enumerate(names)]  # noqa: E731
-    name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("other/kitchen", "photos/kitchen"))
-    assert labels(tmp_path, name).label.any()
-    assert "2 images" in refused(tmp_path, coco(tmp_path, [], images=images("a/kitchen", "b/kitchen")))
-    for changed in ("a\\1/90fbb0c7-kitchen", f"kitchen_jpg.rf.{'0f1e2d3c' * 4}"):
-        assert labels(tmp_path, coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("no", changed))).label.any()
-    assert "did you mean 'kitchem.jpg'" in refused(tmp_path, coco(tmp_path, [], images=images("kitchem")))
+@pytest.mark.parametrize("name", [
+    "photos/kitchen.jpg", "set/photos/kitchen.jpg", "set\\photos\\kitchen.jpg", "a\\1/90fbb0c7-kitchen.jpg", f"kitchen_jpg.rf.{'0f1e2d3c' * 4}.jpg",
+])  # fmt: skip
+def test_a_photo_of_coco_goes_by_its_folders_and_its_name_as_programs_change_it(tmp_path, name):
+    others = ("b/kitchen.jpg",) if "photos" in name else ("no.jpg",)
+    assert labels(tmp_path, pictured(name, *others)(tmp_path)).label.any()
+    assert labels(tmp_path, pictured("ku\u0308che.jpg")(tmp_path), image="photos/k\u00fcche.jpg").label.any()
 
 
 def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(tmp_path):
