@@ -13,6 +13,7 @@ from factorlib.dataset import schema
 from factorlib.dataset.read_dataset import hold_out, read_dataset
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.validation import Validation
+from tests.faults.sample import put
 from tests.refusal import refusal
 
 TURN = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
@@ -176,8 +177,12 @@ BAD = [
     ("photos[0].image", "notes.txt", ".jpg"),
     ("photos[0].image", "", "outside the dataset"),
     ("photos[0].masks", "masks/gone.png", "masks/gone.png"),
-    ("photos[0].masks", "notes.txt", ".png, .json"),
+    ("photos[0].masks", "notes.txt", ".png, .jpg"),
     ("photos[1].masks.red", "gone.png", "gone.png"),
+    ("photos[1].masks.red", "garden.exr", "of a Cryptomatte, export the matte"),
+    ("photos[0].image", "Kitchen.JPG", "did you mean 'kitchen.jpg'"),
+    ("photos[0].image", "C:\\photos\\kitchen.jpg", "name it relative to"),
+    ("photos[0].masks", "\\\\server\\kitchen.png", "name it relative to"),
     ("photos[1].masks", {}, "COCO"),
     ("photos[1].masks.rde", "red.png", "did you mean 'red'"),
     ("photos[0].encoding", "sgrb", "srgb"),
@@ -245,6 +250,18 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
     assert caught.key == outer + inner and caught.cure and words in str(caught)
     assert re.search(r"set/dataset\.yaml(:\d+)?$", str(caught.file))
     assert sorted(folder.parent.rglob("*")) == sorted([*before, folder / "dataset.yaml"]), "something was written"
+
+
+@pytest.mark.parametrize("path, disk", [
+    ("photos\\hall.jpg", "photos/hall.jpg"), (".\\hall.jpg", "hall.jpg"), ("a\\b.jpg", "a\\b.jpg"),
+    ("\u00fc/k\u00fcche.jpg", "u\u0308/ku\u0308che.jpg"), ("u\u0308\\ku\u0308che.jpg", "\u00fc/k\u00fcche.jpg"),
+])  # fmt: skip
+def test_a_path_is_found_with_backslashes_and_in_either_form_of_unicode(folder, path, disk):
+    put(folder / disk, "")
+    assert (
+        dataset_slice(read_dataset(write(folder, changed("photos[0].image", path))), "photo", "kitchen").files[-1]
+        == disk
+    )
 
 
 def test_photos_held_out_by_the_file_or_for_one_run_exist_and_leave_one_to_solve_from(folder):

@@ -15,6 +15,7 @@ from factorlib.labels.label_image import read_labels
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
 from tests.align.test_align import LAMP, TWINS, silhouette_of
+from tests.faults.sample import put
 from tests.refusal import refusal
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\ng shell\nf 1 2 3\nf 1 3 4\ng legs\nf 1 2 4\nf 2 3 4\n"
@@ -109,10 +110,27 @@ def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder)
     assert (folder / "data" / "mine" / "meshes" / "chair.mtl").is_file()
 
 
+@pytest.mark.parametrize("photos, files, expected", [
+    ("front/7 back/7", "front/7.png back/7.jpg.png", {"front_7": "front/7.png", "back_7": "back/7.jpg.png"}),
+    ("rig/front/7 rig/back/7", "front/7.bmp back/7_mask.png", {"rig_front_7": "front/7.bmp", "rig_back_7": "back/7_mask.png"}),
+    ("front/7 back/7", "rig/front/7.png 7.png", {"front_7": "rig/front/7.png", "back_7": "?"}),
+    ("front/7 back/7", "front/7_oak.png back/7/oak.png", {"front_7": {"oak": "front/7_oak.png"}, "back_7": {"oak": "back/7/oak.png"}}),
+    ("7 back/7", "7.tif back/7.gif", {"7": "7.tif", "back_7": "back/7.gif"}),
+    ("ku\u0308che", "k\u00fcche.png", {"k_che": "k\u00fcche.png"}),
+])  # fmt: skip
+def test_masks_in_folders_are_those_of_the_photos_in_such_folders(folder, photos, files, expected):
+    shutil.rmtree(folder / "photos")
+    for name in [*(f"photos/{photo}.png" for photo in photos.split()), *(f"masks/{file}" for file in files.split())]:
+        Image.fromarray(np.resize(np.uint8([0, 1]), (8, 10))).save(put(folder / name, ""))
+    named = {photo["name"]: photo["masks"] for photo in made(folder, meshes=None)[1]["photos"]}
+    assert json.loads(json.dumps(named).replace("masks/", "")) == expected
+
+
 def test_a_coco_file_names_the_materials_of_all_photos_and_what_is_no_name_is_to_be_renamed(folder):
     outlines = [{"id": k, "image_id": k, "category_id": 1, "segmentation": [[1, 1, 5, 1, 5, 5]]} for k in (0, 1)]
     images = [{"id": k, "file_name": photo} for k, photo in enumerate(("kitchen.jpg", "IMG 0412.png"))]
-    categories = [{"id": 1, "name": "red shell"}, {"id": 2, "name": "legs"}]
+    categories = [{"id": 1, "name": "red shell", "supercategory": "chairs"}, {"id": 2, "name": "legs"}]
+    categories += [{"id": 0, "name": "chairs", "supercategory": "none"}]  # as Roboflow names its project
     coco = {"images": images, "annotations": outlines, "categories": categories}
     (folder / "masks" / "all.json").write_text(json.dumps(coco))
     (folder / "meshes" / "chair.obj").write_text(OBJ.replace("g shell", "g red_shell"))

@@ -12,11 +12,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.input_checks import camera_of_photo, convert_intrinsics
+from factorlib.dataset.paths import Refusal
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import ExternalCamera, ObjectsSlice
 from factorlib.dataset.slices import dataset_slice
+from factorlib.dataset.sources.colmap import read_colmap
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.results.photos import PhotoFacts
+from tests.faults.sample import put
 from tests.refusal import refusal
 
 SIZE = 200, 150
@@ -209,11 +212,41 @@ FRAMES = [frame("hall", EYE, (0, 0, 5))]
     (LENS, [frame("hall", 2 * EYE, (0, 0, 5))], "frames[0].transform_matrix", "not a rotation"),
     (LENS, [frame("hall", np.diag([1.0, 1, -1]), (0, 0, 5))], "frames[0].transform_matrix", "reflection"),
     (LENS, [FRAMES[0] | {"transform_matrix": [[1, 0, 0, 0]]}], "frames[0].transform_matrix", "[R | t]"),
-    (LENS, [{"file_path": "hall"}], "frames[0]", "transform_matrix"),
+    (LENS, [{"file_path": "hall"}], "frames", "none has a transform_matrix"),
     (LENS, [frame("cellar", EYE, (0, 0, 5))], "cameras.transforms", "'cellar'"),
 ])  # fmt: skip
 def test_wrong_transforms_are_refused_where_they_are_wrong(folder, lens, frames, key, words):
     refused(transforms(folder, frames, lens), OF_TRANSFORMS, key, words)
+
+
+def test_a_frame_without_a_matrix_is_a_photo_without_a_camera(folder, caplog):
+    frames = [*FRAMES, {"file_path": "attic", "transform_matrix": None}, frame("no\\such", EYE, (0, 0, 5))]
+    assert set(read(transforms(folder, frames), OF_TRANSFORMS).external) == {"hall"}
+    assert "frames[1]: attic has no transform_matrix" in caplog.text
+
+
+ROW, POINTS = "{} 1 0 0 0 0 0 5 1 {}\n", "1.5 2 -1 3 4e1 17\n"
+HALL, ATTIC = ROW.format(1, "hall.png"), ROW.format(2, "my attic 1.png")
+
+
+@pytest.mark.parametrize("text", [
+    HALL + "\n" + ATTIC + "\n", HALL + POINTS + ATTIC + POINTS, HALL + ATTIC, HALL + ATTIC + POINTS,
+    f"# images\n{HALL}# points\n{POINTS}\n# more\n{ATTIC}", HALL.replace("\n", "\r\n") + "\r\n" + ATTIC,
+])  # fmt: skip
+def test_images_txt_is_read_with_lines_of_points_and_without(folder, text):
+    assert [image.name for image in text_model(folder, text)] == ["hall.png", "my attic 1.png"]
+
+
+@pytest.mark.parametrize("text", [HALL + POINTS + POINTS, HALL + ROW.format(2, ""), POINTS + HALL])
+def test_another_line_of_images_txt_is_refused_with_its_number(folder, text):
+    error = refusal(r"line \d: .* words; that of an image has 10", text_model, folder, text)
+    assert error.file.name == "images.txt"
+
+
+def text_model(folder, text):
+    for name, content in (("cameras", "1 SIMPLE_PINHOLE 200 150 300 104 71\n"), ("images", text)):
+        put(folder / f"model/{name}.txt", content)
+    return read_colmap("model", Refusal(folder / "dataset.yaml", folder))
 
 
 K = [300.0, 0, 103.5, 0, 300.0, 70.5, 0, 0, 1.0]

@@ -16,16 +16,18 @@ from factorlib.geometry.raster import rasterise
 from factorlib.onboarding.from_photos import (
     REVOLVED,
     SHAPE,
+    cameras_of_folder,
     dataset_from_photos,
     distorted_camera,
     doubtful_masks,
     read_views,
 )
 from factorlib.onboarding.matte import MatteModel, doubt, foreground, opaque_pixels
-from factorlib.onboarding.photo_folder import read_photo_folder
+from factorlib.onboarding.photo_folder import Cameras, read_photo_folder
 from factorlib.scenes.stage_runs import CHECKOUT
 from factorlib.shapes.hull import focal_by_hull
 from factorlib.validation import Validation
+from tests.faults.sample import put
 from tests.images.test_photo import save
 from tests.refusal import refusal
 from tests.shapes.outlines import CAMERA, looking_from, outline
@@ -109,16 +111,58 @@ def test_a_mask_of_another_thing_is_found_again_where_the_other_photos_show_the_
     assert not any("differs" in note for note in notes)
 
 
-@pytest.mark.parametrize("mask", ["7_mask.png", "7.jpg.png", "masks/7.png", "masks/7.jpg", "alpha/m.png"])
-def test_masks_are_no_photos_and_the_cameras_tell_which_images_are(tmp_path, mask):
-    for name in (mask, "images/7.jpg", "images_2/7.jpg", "other/8.jpg"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"1")
-    frame = {"file_path": "images/7.jpg", "mask_path": "alpha/m.png"}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    images, masks, cameras = read_photo_folder(tmp_path, sorted(p for p in tmp_path.rglob("*") if p.is_file()))
-    assert images == [tmp_path / "images/7.jpg"] and masks == {"7": tmp_path / mask}
-    assert cameras.source == {"transforms": "cameras/transforms.json"}
+NFC, NFD = "k\u00fcche", "ku\u0308che"
+RIG = [
+    f"{kind}/{side}/7.{suffix}" for kind, suffix in (("images", "jpg"), ("masks", "png")) for side in ("front", "back")
+]
+RIG_MASKS = {f"images/{side}/7.jpg": f"masks/{side}/7.png" for side in ("front", "back")}
+ONE = ["images/7.jpg", "images_2/7.jpg", "other/8.jpg"]
+POLYCAM = [
+    f"keyframes/{kind}/7.{suffix}" for kind, suffix in (("images", "jpg"), ("depth", "png"), ("confidence", "png"))
+]
+FOLDERS = [  # files, masks of the frames of transforms.json, the mask of each photo or the words of an error
+    *(([*ONE, mask], {"images/7.jpg": "alpha/m.png" if "alpha" in mask else None}, {"images/7.jpg": mask}) for mask in
+      ("7_mask.png", "7.jpg.png", "masks/7.png", "masks/7.jpg", "masks/7.bmp", "7-Mask.webp", "alpha/m.png", "sam_masks/7.png")),
+    ([*ONE, "masks/7.png", "masks_2/7.png"], {"images\\7.jpg": "masks\\7.png"}, {"images/7.jpg": "masks/7.png"}),
+    ([*ONE, "msk/7.png"], {"./images\\7.jpg": "msk\\7.png"}, {"images/7.jpg": "msk/7.png"}),
+    ([*ONE, "depths/7.png"], {"C:\\scan\\images\\7.jpg": None, "images/9.jpg": None}, {"images/7.jpg": None}),
+    (ONE, {"images/7.jpg": "masks/7.png"}, "mask_path of images/7.jpg: there is no picture 'masks/7.png'"),
+    (RIG, None, RIG_MASKS),
+    (RIG, RIG_MASKS, RIG_MASKS),
+    (RIG, dict.fromkeys(RIG_MASKS), RIG_MASKS),
+    (RIG[:3], dict.fromkeys(RIG_MASKS), RIG_MASKS | {"images/back/7.jpg": None}),
+    (["front/images/7.jpg", "back/images/7.jpg", "front/mask/7.jpg.png"], None, {"front/images/7.jpg": "front/mask/7.jpg.png", "back/images/7.jpg": None}),
+    ([*RIG[:2], "masks/7.png"], None, "not clear whether it is the mask of images/back/7.jpg"),
+    (["7.jpg", "masks/7.png", "sam_masks/7.png"], None, "not clear whether it is the mask of 7.jpg"),
+    (["images/7.jpg", "images_4/7.jpg", "masks/7.png", "masks_4/7.png"], None, {"images/7.jpg": "masks/7.png"}),
+    ([*POLYCAM, "thumbnail.jpg"], None, {POLYCAM[0]: None}),
+    ([*POLYCAM, "keyframes/corrected_images/7.jpg"], None, {"keyframes/corrected_images/7.jpg": None}),
+    ([f"{NFD}.jpg", f"{NFC}_mask.png"], None, {f"{NFD}.jpg": f"{NFC}_mask.png"}),
+    ([f"images/{NFD}.jpg", f"masks/{NFC}.png"], {f"images/{NFC}.jpg": None}, {f"images/{NFD}.jpg": f"masks/{NFC}.png"}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("names, frames, expected", FOLDERS)
+def test_each_photo_has_its_own_mask_and_neither_masks_nor_copies_nor_depth_are_photos(
+    tmp_path, names, frames, expected
+):
+    files = [put(tmp_path / name, "1") for name in names]
+    if frames:
+        content = {"frames": [{"file_path": name, "mask_path": mask} for name, mask in frames.items()]}
+        files.append(put(tmp_path / "transforms.json", json.dumps(content)))
+    if isinstance(expected, str):
+        assert refusal(expected, read_photo_folder, tmp_path, files).file
+    else:
+        images, masks, _ = read_photo_folder(tmp_path, files)
+        masks = {str(image.relative_to(tmp_path)): masks.get(image) for image in images}
+        assert masks == {image: mask and tmp_path / mask for image, mask in expected.items()}
+
+
+def test_wrong_cameras_are_named_by_their_own_file_also_where_the_focal_length_is_missing(tmp_path):
+    frames = [{"file_path": "7.jpg", "transform_matrix": [[0, 0, 0, 0]] * 3}]
+    file = put(tmp_path / "transforms.json", json.dumps({"frames": frames}))
+    cameras = Cameras({"transforms": "cameras/transforms.json"}, tmp_path, [file])
+    assert refusal("not a rotation", cameras_of_folder, {}, {}, cameras, tmp_path, None).file == file
 
 
 @pytest.mark.parametrize("top, dtype", [(255, np.uint8), (65535, np.uint16)])
