@@ -7,7 +7,7 @@ import os
 import stat
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path, PurePath, PurePosixPath
 from typing import NoReturn
 
@@ -29,21 +29,15 @@ def plain_path(path: str | PurePath) -> PurePosixPath:
 
 
 def path_on_disk(folder: Path, path: str) -> str:
-    """Return a path with slashes for backslashes, and each of its names in the Unicode form that the disk has.
+    """Return a path with slashes for backslashes, in the Unicode form (NFC or NFD) that the disk has.
 
     Args:
         folder: folder that the path is relative to
         path: the path, which may not exist
     """
-    if ("\\" not in path and path.isascii()) or os.path.lexists(folder / path):
-        return path
-    target = PurePosixPath()
-    for part in PurePosixPath(path.replace("\\", "/")).parts:
-        with suppress(OSError, ValueError):  # no such folder
-            same = [name for name in os.listdir(folder / target) if plain_path(name) == plain_path(part)]
-            part = min(same, key=lambda name: name != part, default=part)
-        target /= part
-    return str(target)
+    slashed = path.replace("\\", "/")
+    forms = [path, slashed, *(unicodedata.normalize(form, slashed) for form in ("NFC", "NFD"))]
+    return next((form for form in forms if os.path.lexists(folder / form)), slashed)
 
 
 def nearest_paths(path: PurePath, others: Sequence[PurePosixPath]) -> list[PurePosixPath]:

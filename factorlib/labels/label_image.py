@@ -197,10 +197,10 @@ def warn_of_strays(inside: Bool[np.ndarray, "h w"], path: Path, key: str) -> Non
     strays = np.flatnonzero((areas < STRAY_SHARE * areas.max()) & (areas > 0))
     if len(strays):
         centres = np.multiply(ndimage.center_of_mass(counts, groups, strays), cell).round().astype(int).tolist()
-        named = [f"{areas[k]:.0f} px at ({x}, {y})" for k, (y, x) in zip(strays, centres)]
-        more = ", …" * (len(named) > MOST_STRAYS)
-        text = "%s: %s: %d small pieces lie far from the thing: %s: erase them if they are no part of it"
-        log.warning(text, path, key, len(named), ", ".join(named[:MOST_STRAYS]) + more)
+        named = ", ".join(f"{areas[k]:.0f} px at ({x}, {y})" for k, (y, x) in zip(strays, centres[:MOST_STRAYS]))
+        log.warning(
+            "%s: %s: %d small pieces far from the thing: %s; erase what is no part of it", path, key, len(strays), named
+        )
 
 
 def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:

@@ -15,6 +15,7 @@ the number of runs and one picture. The shapes of other photos in the file are l
 
 import logging
 import re
+import warnings
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -177,13 +178,21 @@ class _Picture(msgspec.Struct, frozen=True):
 def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Picture:
     """Decode a picture as displayed, and check its size."""
     check_plain(path, "a picture", key)
-    with reading("a picture", path, key, "save the mask again, as PNG"), Image.open(path, formats=FORMATS) as image:
+    with (
+        warnings.catch_warnings(action="ignore"),  # of metadata
+        reading("a picture", path, key, "save the mask again, as PNG"),
+        Image.open(path, formats=FORMATS) as image,
+    ):
         size = size or image.size[::-1]
         if sorted(image.size) != sorted(size):  # before anything is decoded
             check_size(image.size[::-1], size, path, key)
         if getattr(image, "n_frames", 1) > 1 or image.mode in ("I", "F"):
-            fault = "holds several pictures, or values of 32 bits"
-            raise InputError(fault, file=path, key=key, cure="save one picture of 8 or 16 bits, as PNG")
+            raise InputError(
+                "holds several pictures, or values of 32 bits",
+                file=path,
+                key=key,
+                cure="save one picture of 8 or 16 bits, as PNG",
+            )
         raw = re.search(r"\b(L|LA|RGB|RGBA);\d+", str(image.tile))
         lossy = image.format == "JPEG" or image.info.get("compression") in LOSSY
         lossy |= image.format == "WEBP" and b"VP8L" not in Path(path).read_bytes()[: 1 << 16]
@@ -203,8 +212,12 @@ def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.nd
     if picture.lossy:
         white = np.count_nonzero(values >= LEFT_OUT - RINGING)
         if values.any() and np.count_nonzero(values > RINGING) >= (1 + MOST_SOFT) * white:
-            cure = "save labels as PNG; or, if it shows one material, write masks: {material: file}"
-            raise InputError("is of a lossy format, which changes labels", file=path, key=key, cure=cure)
+            raise InputError(
+                "is of a lossy format, which changes labels",
+                file=path,
+                key=key,
+                cure="save labels as PNG; or, if it shows one material, write masks: {material: file}",
+            )
         values = np.where(values > LEFT_OUT // 2, LEFT_OUT, 0).astype(np.uint16)
     return values
 
@@ -347,8 +360,12 @@ def read_annotations(path: str | Path, image: str = "", key: str | None = None) 
         names = dict.fromkeys(shape.label for shape in labelme.shapes)
         for k, kind in enumerate(shape.shape_type for shape in labelme.shapes):
             if kind not in SHAPES:
-                fault = f"{one_line(repr(kind))} is not read, but {', '.join(SHAPES)} are"
-                raise InputError(fault, file=path, key=f"shapes[{k}].shape_type", cure="draw its outline, or delete it")
+                raise InputError(
+                    f"{one_line(repr(kind))} is not read, but {', '.join(SHAPES)} are",
+                    file=path,
+                    key=f"shapes[{k}].shape_type",
+                    cure="draw its outline, or delete it",
+                )
         annotations = [Annotation(0, shape.label, msgspec.Raw(_segmentation(shape))) for shape in labelme.shapes]
         return _LabelmeCoco(images, annotations, [Category(name, name) for name in names])
 

@@ -82,14 +82,20 @@ def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict
     times = Counter(path for pair in pairs for path in pair)
     for photo, mask in pairs:
         if times[photo] > 1 or times[mask] > 1:
-            fault = f"it is not clear whether it is the mask of {photo}: there are others of this name"
-            cure = "put masks into subfolders as the photos are, masks/<folder>/<photo>.png, one for each photo"
-            raise InputError(fault, file=folder / mask, key="PHOTOS", cure=cure)
+            raise InputError(
+                f"it is not clear whether it is the mask of {photo}: there are others of this name",
+                file=folder / mask,
+                key="PHOTOS",
+                cure="put masks into subfolders as the photos are, masks/<folder>/<photo>.png, one for each photo",
+            )
     paired |= dict(pairs)
     if gone := [name for name, image in named.items() if frames[name] and image not in paired]:
-        fault = f"there is no picture '{frames[gone[0]]}'"
-        key = f"mask_path of {gone[0]}"
-        raise InputError(fault, file=cameras and cameras.files[0], key=key, cure="put it there, or delete the key")
+        raise InputError(
+            f"there is no picture '{frames[gone[0]]}'",
+            file=cameras and cameras.files[0],
+            key=f"mask_path of {gone[0]}",
+            cure="put it there, or delete the key",
+        )
     return sorted(places[p] for p in images), {places[p]: places[mask] for p, mask in paired.items()}, cameras
 
 

@@ -253,15 +253,12 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
 
 
 @pytest.mark.parametrize("path, disk", [
-    ("photos\\hall.jpg", "photos/hall.jpg"), (".\\hall.jpg", "hall.jpg"), ("a\\b.jpg", "a\\b.jpg"),
+    ("photos\\hall.jpg", "photos/hall.jpg"), ("a\\b.jpg", "a\\b.jpg"),
     ("\u00fc/k\u00fcche.jpg", "u\u0308/ku\u0308che.jpg"), ("u\u0308\\ku\u0308che.jpg", "\u00fc/k\u00fcche.jpg"),
 ])  # fmt: skip
 def test_a_path_is_found_with_backslashes_and_in_either_form_of_unicode(folder, path, disk):
     put(folder / disk, "")
-    assert (
-        dataset_slice(read_dataset(write(folder, changed("photos[0].image", path))), "photo", "kitchen").files[-1]
-        == disk
-    )
+    assert read_dataset(write(folder, changed("photos[0].image", path))).photo("kitchen").image == disk
 
 
 def test_photos_held_out_by_the_file_or_for_one_run_exist_and_leave_one_to_solve_from(folder):

@@ -12,14 +12,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.input_checks import camera_of_photo, convert_intrinsics
-from factorlib.dataset.paths import Refusal
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import ExternalCamera, ObjectsSlice
 from factorlib.dataset.slices import dataset_slice
-from factorlib.dataset.sources.colmap import read_colmap
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.results.photos import PhotoFacts
-from tests.faults.sample import put
 from tests.refusal import refusal
 
 SIZE = 200, 150
@@ -46,7 +43,7 @@ def folder(tmp_path):
 
 def read(folder, cameras, objects=(CHAIR,), names=PHOTOS, photo=None):
     """A dataset of photos with a source of cameras; `photo` is laid over the first."""
-    photos = [{"name": name.replace("000007", "seven"), "image": f"photos/{name}.png", "masks": "mask.png",
+    photos = [{"name": name.replace("000007", "seven").replace(" ", "_"), "image": f"photos/{name}.png", "masks": "mask.png",
                "objects": list(objects)} for name in names]  # fmt: skip
     photos[0] |= photo or {}
     meshes = {"chair": {"file": "chair.ply", "material": "red"}}
@@ -225,28 +222,25 @@ def test_a_frame_without_a_matrix_is_a_photo_without_a_camera(folder, caplog):
     assert "frames[1]: attic has no transform_matrix" in caplog.text
 
 
-ROW, POINTS = "{} 1 0 0 0 0 0 5 1 {}\n", "1.5 2 -1 3 4e1 17\n"
-HALL, ATTIC = ROW.format(1, "hall.png"), ROW.format(2, "my attic 1.png")
+HALL, TRACKS = "1 .6 .8 0 0 0 0 5 1 hall.png\n", "1.5 2 -1 3 4e1 17\n"
+ATTIC = HALL.replace("hall", "my house/attic 1")
 
 
-@pytest.mark.parametrize("text", [
-    HALL + "\n" + ATTIC + "\n", HALL + POINTS + ATTIC + POINTS, HALL + ATTIC, HALL + ATTIC + POINTS,
-    f"# images\n{HALL}# points\n{POINTS}\n# more\n{ATTIC}", HALL.replace("\n", "\r\n") + "\r\n" + ATTIC,
+@pytest.mark.parametrize("text, words", [
+    (HALL + "\n" + ATTIC + "\n", None), (HALL + TRACKS + ATTIC + TRACKS, None), (HALL + ATTIC, None),
+    (HALL + ATTIC + TRACKS, None), (f"# images\n{HALL}# points\n{TRACKS}\n# more\n{ATTIC}", None),
+    (HALL.replace("\n", "\r\n") + "\r\n" + ATTIC, None), (HALL + TRACKS + TRACKS, "line 3: '1.5 2 -1"),
+    (HALL + HALL.replace("hall.png", ""), "line 2: '1 .6 .8 0 0 0 0 5 1' has 9 words"), (TRACKS + HALL, "line 1"),
 ])  # fmt: skip
-def test_images_txt_is_read_with_lines_of_points_and_without(folder, text):
-    assert [image.name for image in text_model(folder, text)] == ["hall.png", "my attic 1.png"]
-
-
-@pytest.mark.parametrize("text", [HALL + POINTS + POINTS, HALL + ROW.format(2, ""), POINTS + HALL])
-def test_another_line_of_images_txt_is_refused_with_its_number(folder, text):
-    error = refusal(r"line \d: .* words; that of an image has 10", text_model, folder, text)
-    assert error.file.name == "images.txt"
-
-
-def text_model(folder, text):
-    for name, content in (("cameras", "1 SIMPLE_PINHOLE 200 150 300 104 71\n"), ("images", text)):
-        put(folder / f"model/{name}.txt", content)
-    return read_colmap("model", Refusal(folder / "dataset.yaml", folder))
+def test_images_txt_is_read_with_lines_of_points_or_without_and_refused_by_line(folder, text, words):
+    colmap(folder, form="text")
+    (folder / "sparse/0/images.txt").write_text(text)
+    (folder / "photos/attic 1.png").write_text("")
+    source = {"colmap": "sparse/0"}
+    if words:
+        refused(folder, source, "cameras.colmap", words)
+    else:
+        assert len(read(folder, source, names=("hall", "attic 1")).external) == 2
 
 
 K = [300.0, 0, 103.5, 0, 300.0, 70.5, 0, 0, 1.0]

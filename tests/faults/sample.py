@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import io
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import yaml
+from PIL import Image
 
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import PhotoSlice
@@ -132,6 +134,14 @@ LABEL = np.zeros((H, W), np.uint8)
 LABEL[2:6, 2:14], LABEL[7:11, 3:12] = 1, 2
 PIXELS = zlib.compress(b"".join(b"\0" + row.tobytes() for row in LABEL))
 MASK = png(png_header(W, H), PIXELS)
+PICTURES = ("tiff", "bmp", "gif", "tga", "webp", "jpeg")  # formats of masks besides PNG
+
+
+def picture(kind: str, values: np.ndarray) -> bytes:
+    Image.fromarray(values).save(stream := io.BytesIO(), kind, lossless=True)
+    return stream.getvalue()
+
+
 RED = png(png_header(W, H), zlib.compress(b"".join(b"\0" + row.tobytes() for row in np.uint8(255) * (LABEL == 1))))
 PHOTO = png(png_header(W, H, kind=2), zlib.compress(b"".join(b"\0" + bytes(range(60, 60 + 3 * W)) for _ in range(H))))
 COCO = {
@@ -239,7 +249,8 @@ CONTENT = {
     "m/box.gltf": json.dumps(gltf_header("../buffers/b%201.bin")).encode(), "buffers/b 1.bin": DATA, "vase.ply": PLY,
     "model/cameras.bin": cameras_bin(), "model/images.bin": images_bin(), "text/cameras.txt": CAMERAS_TXT,
     "text/images.txt": IMAGES_TXT,
-    **MESHES, **{name: json.dumps(value).encode() for name, value in PLAIN.items()},
+    **MESHES, **{f"mask.{kind}": picture(kind, LABEL * np.uint8(255 if kind == "jpeg" else 1)) for kind in PICTURES},
+    **{name: json.dumps(value).encode() for name, value in PLAIN.items()},
 }  # fmt: skip
 
 

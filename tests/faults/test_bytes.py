@@ -56,6 +56,7 @@ from tests.faults.sample import (
     MESHES,
     OBJ,
     OFF,
+    PICTURES,
     PLAIN,
     PLY,
     PLY_TEXT,
@@ -325,9 +326,9 @@ REFUSED = {
         ("poses", "hall", "vase", "rotation", [[2, 0, 0]] * 3, "rotation"),
     )],
     ("mask", "mask.png"): [
-        *((content, "not readable as a PNG") for content in (b"", b"GIF89a", sample.MASK[:40],
+        *((content, "not readable as a picture") for content in (b"", b"GIF89a", sample.MASK[:40],
         sample.MASK[:16] + bytes(99))),
-        (sample.MASK[:33] + sample.chunk(b"zTXt", TEXT) + sample.MASK[33:], "not readable as a PNG"),
+        (sample.MASK[:33] + sample.chunk(b"zTXt", TEXT) + sample.MASK[33:], "not readable as a picture"),
         (long_png(), "the mask is 30000 × 30000 pixels, the photo 16 × 12"), (rows(bytes(range(48)), kind=2), "colour"),
         (rows(bytes([7] * W)), "unknown label 7"), (rows(bytes(W)), "the mask is empty"),
     ],
@@ -452,7 +453,8 @@ def test_it_is_refused_by_name_soon_and_in_little_memory(folder, reader, name):
 
 
 GOOD = [
-    ("set", "dataset.yaml"), ("set", "truth.yaml"), ("set", "m/box.gltf"), ("mask", "mask.png"), ("mask", "coco.json"),
+    ("set", "dataset.yaml"), ("set", "truth.yaml"), ("set", "m/box.gltf"), ("mask", "coco.json"),
+    *(("mask", f"mask.{kind}") for kind in ("png", *PICTURES[:-1])),
     ("mask", "labelme.json"),
     ("photo", "7.png"), ("observations", "observations.parquet"), ("lobes", "solve/lobes.parquet"),
     ("poses", "poses.json"), ("objects", "m/chair.obj"), *(("mesh", name) for name in sample.MESHES),
@@ -543,7 +545,7 @@ def told(verb, capsys) -> str:
 
 
 FAULTS = {  # file -> what is in it, and words of the error
-    "7.png": (sample.PHOTO[:-30], "truncated or damaged"), "mask.png": (b"\x89PNG", "not readable as a PNG"),
+    "7.png": (sample.PHOTO[:-30], "truncated or damaged"), "mask.png": (b"\x89PNG", "not readable as a picture"),
     "m/chair.obj": (OBJ.replace("v 1.0", "v nan"), "not finite"), "buffers/b 1.bin": (DATA[:30], "has 30 bytes, but the header states 72"),
 }  # fmt: skip
 
@@ -711,6 +713,7 @@ PARTS = {  # name -> (file, its contents, who reads it); None: the good file's b
     "true light": ("light.exr", None, "true light"),
     **{name: (file, spoiled_json(PLAIN[file]), reader) for name, (file, reader) in PLAIN_PARTS.items()},
     **{name: (name, spoiled_mesh(name), read_usable_mesh) for name in MESHES},
+    **{f"mask.{kind}": (f"mask.{kind}", None, "mask") for kind in PICTURES},
     "photo": ("7.png", None, "masks"),
 }
 

@@ -132,7 +132,7 @@ FOLDERS = [  # files, masks of the frames of transforms.json, the mask of each p
     (RIG, dict.fromkeys(RIG_MASKS), RIG_MASKS),
     (RIG[:3], dict.fromkeys(RIG_MASKS), RIG_MASKS | {"images/back/7.jpg": None}),
     (["front/images/7.jpg", "back/images/7.jpg", "front/mask/7.jpg.png"], None, {"front/images/7.jpg": "front/mask/7.jpg.png", "back/images/7.jpg": None}),
-    ([*RIG[:2], "masks/7.png"], None, "not clear whether it is the mask of images/back/7.jpg"),
+    ([*RIG[:2], "masks/7.png"], None, "not clear whether it is the mask of images/(front|back)/7.jpg"),
     (["7.jpg", "masks/7.png", "sam_masks/7.png"], None, "not clear whether it is the mask of 7.jpg"),
     (["images/7.jpg", "images_4/7.jpg", "masks/7.png", "masks_4/7.png"], None, {"images/7.jpg": "masks/7.png"}),
     ([*POLYCAM, "thumbnail.jpg"], None, {POLYCAM[0]: None}),
