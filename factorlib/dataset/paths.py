@@ -41,9 +41,9 @@ def path_on_disk(folder: Path, path: str) -> str:
 
 
 def nearest_paths(path: PurePath, others: Sequence[PurePosixPath]) -> list[PurePosixPath]:
-    """Return those of the other paths that share the most folders with a path: all, if none shares any."""
+    """Return those of the other paths that share the most folders with a path, and then its name: all, if none does."""
     folders = set(path.parent.parts)
-    shared = [len(folders.intersection(other.parent.parts)) for other in others]
+    shared = [2 * len(folders.intersection(other.parent.parts)) + (other.name == path.name) for other in others]
     return [other for other, count in zip(others, shared) if count == max(shared)]
 
 

@@ -198,12 +198,11 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
         lossy |= image.format == "WEBP" and b"VP8L" not in Path(path).read_bytes()[: 1 << 16]
         ImageOps.exif_transpose(image, in_place=True)
         check_size(image.size[::-1], size, path, key)
-        if image.mode not in MODES or (image.mode == "P" and image.format != "PNG"):  # others may reorder a palette
-            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        pixels = np.asarray(image)
-        has_alpha = image.mode in ("P", "LA", "RGBA") and image.has_transparency_data
-        opaque = opaque_part(np.asarray(image.convert("RGBA"))[..., 3]) if has_alpha else None
-    return _Picture(pixels, opaque, raw[0] if raw else "", lossy)
+        plain = image.mode in MODES and (image.mode != "P" or image.format == "PNG")  # others may reorder a palette
+        decoded = image if plain else image.convert("RGBA" if image.has_transparency_data else "RGB")
+        has_alpha = decoded.mode in ("P", "LA", "RGBA") and decoded.has_transparency_data
+        opaque = opaque_part(np.asarray(decoded.convert("RGBA"))[..., 3]) if has_alpha else None
+    return _Picture(np.asarray(decoded), opaque, raw[0] if raw else "", lossy)
 
 
 def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:

@@ -27,7 +27,7 @@ TRANSFORMS = ("transforms.json", "transforms_train.json")
 MODELS = tuple((f"cameras{suffix}", f"images{suffix}") for suffix in (".bin", ".txt"))
 PICTURES = (*IMAGES, *MASK_IMAGES)
 AUXILIARY = re.compile(
-    r"(depth|confidence|normal|thumb(nail)?)s?([_-]?maps?)?(_\d+)?", re.IGNORECASE
+    r"(depth|confidence|normal|thumb(nail)?|preview)s?([_-]?maps?)?(_\d+)?", re.IGNORECASE
 )  # names, no photos
 MASK_FOLDER = re.compile(r"(^|[_ -])(mask|msk|segmentation|silhouette)", re.IGNORECASE)
 DOWNSAMPLED = re.compile(r"^((?:image|mask)s?)_\d+$")  # folders of copies, as NeRF's programs write them
@@ -92,7 +92,7 @@ def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict
     if gone := [name for name, image in named.items() if frames[name] and image not in paired]:
         raise InputError(
             f"there is no picture '{frames[gone[0]]}'",
-            file=cameras and cameras.files[0],
+            file=cameras.files[0] if cameras else folder,
             key=f"mask_path of {gone[0]}",
             cure="put it there, or delete the key",
         )
@@ -147,29 +147,28 @@ def _namesakes(
     ]
 
 
+def _beside(file: Path, path: str) -> PurePosixPath:
+    """Return a path that a file names relative to itself."""
+    return plain_path(os.path.normpath(file.parent / plain_path(path)))
+
+
 def _cameras(folder: Path, files: list[Path]) -> tuple[Cameras | None, dict[PurePosixPath, PurePosixPath | None]]:
     """Return the cameras in a folder, and the names of images in them, each with the place of its mask or None.
 
-    The source is that nearest to the top.
-
-    Of several COLMAP models it is the largest one.
+    Both are relative to the folder.  The source is the transforms.json nearest to the top, else the largest model.
     """
     if transforms := sorted((path for path in files if path.name in TRANSFORMS), key=lambda path: len(path.parts)):
         with reading("transforms.json", transforms[0], "PHOTOS"):
             frames = msgspec.json.decode(read_bytes(transforms[0], "JSON", most_bytes=MOST_BYTES))["frames"]
-            masks = {plain_path(frame["file_path"]): frame.get("mask_path") for frame in frames}
-        place = transforms[0].relative_to(folder)
-        names = {
-            name: mask and plain_path(os.path.normpath(place.parent / plain_path(mask))) for name, mask in masks.items()
-        }
-        return Cameras({"transforms": f"cameras/{place.as_posix()}"}, folder, transforms[:1]), names
+            masks = {str(frame["file_path"]): frame.get("mask_path") for frame in frames}
+        file = transforms[0].relative_to(folder)
+        names = {_beside(file, name): mask and _beside(file, mask) for name, mask in masks.items()}
+        return Cameras({"transforms": f"cameras/{file.as_posix()}"}, folder, transforms[:1]), names
     pairs = [[path.with_name(camera), path] for camera, image in MODELS for path in files if path.name == image]
     models = [pair for pair in pairs if pair[0] in files]
     if not models:
         return None, {}
     model = max(models, key=lambda pair: pair[1].stat().st_size)
-    place = model[0].parent.relative_to(folder).as_posix()
-    images = read_colmap(place, Refusal(model[1], folder))
-    return Cameras({"colmap": f"cameras/{place}"}, folder, model), {
-        plain_path(str(image.name)): None for image in images
-    }
+    at = model[0].parent.relative_to(folder).as_posix()
+    images = read_colmap(at, Refusal(model[1], folder))
+    return Cameras({"colmap": f"cameras/{at}"}, folder, model), {plain_path(f"{at}/{i.name}"): None for i in images}

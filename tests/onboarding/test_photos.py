@@ -127,6 +127,7 @@ FOLDERS = [  # files, masks of the frames of transforms.json, the mask of each p
     ([*ONE, "msk/7.png"], {"./images\\7.jpg": "msk\\7.png"}, {"images/7.jpg": "msk/7.png"}),
     ([*ONE, "depths/7.png"], {"C:\\scan\\images\\7.jpg": None, "images/9.jpg": None}, {"images/7.jpg": None}),
     (ONE, {"images/7.jpg": "masks/7.png"}, "mask_path of images/7.jpg: there is no picture 'masks/7.png'"),
+    (["7.jpg", "7.png"], {"7.jpg": None, "7.png": None}, {"7.jpg": None, "7.png": None}),
     (RIG, None, RIG_MASKS),
     (RIG, RIG_MASKS, RIG_MASKS),
     (RIG, dict.fromkeys(RIG_MASKS), RIG_MASKS),
