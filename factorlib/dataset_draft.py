@@ -38,6 +38,7 @@ from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_valu
 from factorlib.labels.label_image import read_labels
 from factorlib.labels.mask_files import (
     BACKGROUND,
+    LabelmeCoco,
     read_annotations,
     read_inside,
     read_labelmap,
@@ -294,10 +295,11 @@ def _annotated_masks(
     suffixes = MASK_IMAGES if sources[0].name == LABELMAP else (".json",)
     entries = [path for path in file if path.suffix.lower() in suffixes and path.parent.name != "SegmentationObject"]
     masks = Masks(by_photo={photo: file[path] for path in entries if (photo := by_file[path])})
-    if not masks.by_photo:
-        masks.by_photo = dict.fromkeys(photos, file[sources[0]])
-        missing += [f"{file[path]}: a second COCO file is not used" for path in sources[1:]]
-        sources = sources[:1]
+    coco = [p for p in sources if p.name != LABELMAP and not isinstance(read_annotations(p), LabelmeCoco)]
+    if coco and not masks.by_photo:
+        masks.by_photo = dict.fromkeys(photos, file[coco[0]])
+        missing += [f"{file[path]}: a second COCO file is not used" for path in coco[1:]]
+        sources = coco[:1]
     names = [name for path in sources for name in _annotated_materials(path, file[path], missing)]
     masks.materials = list(dict.fromkeys(names))
     return masks

@@ -316,7 +316,7 @@ class Coco(msgspec.Struct, frozen=True):
     categories: list[Category]
 
 
-class _LabelmeCoco(Coco, frozen=True):
+class LabelmeCoco(Coco, frozen=True):
     """Shapes of labelme as COCO's."""
 
     PLACE: ClassVar[str] = "shapes[{}]"
@@ -366,7 +366,7 @@ def read_annotations(path: str | Path, image: str = "", key: str | None = None) 
                     cure="draw its outline, or delete it",
                 )
         annotations = [Annotation(0, shape.label, msgspec.Raw(_segmentation(shape))) for shape in labelme.shapes]
-        return _LabelmeCoco(images, annotations, [Category(name, name) for name in names])
+        return LabelmeCoco(images, annotations, [Category(name, name) for name in names])
 
 
 def _segmentation(shape: LabelmeShape) -> bytes:
