@@ -126,8 +126,7 @@ def new_dataset(
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes else []  # including .mtl and buffers
     missing: list[str] = []
     paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
-    images_of = {name: plain_path(path.relative_to(photos)) for name, path in images.items()}
-    labelled = _masks(masks, mask_files, images_of, beside, missing) if masks else _cut_outs(paths, images, missing)
+    labelled = _masks(masks, mask_files, paths, beside, missing) if masks else _cut_outs(paths, images, missing)
     entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
     unmasked = [NO_MASK.format(photo) for photo in images if photo not in labelled.by_photo]
@@ -235,7 +234,7 @@ def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[P
 def _masks(
     folder: Path,
     paths: list[Path],
-    photos: Mapping[str, PurePosixPath],
+    photos: Mapping[str, str],
     beside: Mapping[str, Path],
     missing: list[str],
 ) -> Masks:
@@ -244,7 +243,7 @@ def _masks(
     Args:
         folder: the folder
         paths: the files
-        photos: path of each photo below the folder of photos
+        photos: path of each photo in the dataset
         beside: mask of each photo that has one beside the photos, which needs no search by name
         missing: receives what the user has to write
     """
@@ -359,9 +358,9 @@ def _tails(place: PurePosixPath) -> list[str]:
     return [_word("_".join(parts[k:])) for k in range(len(parts))]
 
 
-def _names_of(photos: Mapping[str, PurePosixPath]) -> dict[str, str]:
+def _names_of(photos: Mapping[str, str]) -> dict[str, str]:
     """Return each photo's name by that name, and by the words of its path that no other photo has."""
-    words = [(word, name) for name, place in photos.items() for word in {*_tails(place)}]
+    words = [(word, name) for name, place in photos.items() for word in {*_tails(plain_path(place))}]
     times = Counter(word for word, _ in words)
     return {word: name for word, name in words if times[word] == 1} | {name: name for name in photos}
 

@@ -5,6 +5,7 @@ dataset.yaml.  Of a photo, the header and the first and last row are read.  The 
 science, and a run with nothing to do must not import any.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -21,12 +22,13 @@ from factorlib.evaluate.truth import read_true_albedo, read_true_light, read_tru
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
-from factorlib.labels.label_image import check_materials, read_labels, read_object_indices, warn_of_strays
+from factorlib.labels.label_image import check_materials, describe_specks, read_labels, read_object_indices
 from factorlib.meshes.read_mesh import part_labels, read_mesh, read_parts
 from factorlib.meshes.triangle_soup import Limits
 from factorlib.recipe.kinds import is_light_file
 from factorlib.yamlfile import convert
 
+log = logging.getLogger("factorlib.validation")
 Check = Callable[[], object]
 NOT_ROUND = 0.02  # largest variation of a ball's radius, relative
 
@@ -150,7 +152,8 @@ class Validation:
         self._pixels.append(partial(opened.check_pixels, path, f"{key}.image"))
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
         file = self.file(entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values())))
-        warn_of_strays(labels.label > 0, file, f"{key}.masks")
+        if specks := describe_specks(labels.label > 0):
+            log.warning("%s: %s.masks: %s", file, key, specks)
         object_masks = [(obj.name, obj.mask) for obj in entry.objects]
         objects = read_object_indices(object_masks, self.file, size, f"{key}.objects")
         object_materials = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]

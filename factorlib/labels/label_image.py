@@ -21,12 +21,10 @@ from factorlib.labels.mask_files import read_coco, read_colours, read_inside, re
 
 MUCH = 0.1  # share of an object's pixels that is more than a slip of the brush
 DRAWN_EDGE = 2  # width of the pixels that adjacent outlines may share; they are left out without an error
-STRAY_SHARE = 0.01  # area of a piece, as a share of the largest one's, below which it is a speck
-STRAY_GAP = (
-    0.1  # distance between pieces, in extents of the largest one, above which they are parts of different things
-)
-STRAY_CELLS = 512  # greatest number of cells along a side, on which pieces are sought
-MOST_STRAYS = 5  # pieces that a warning names
+SPECK_SHARE = 0.01  # area of a piece, as a share of the largest one's, below which it is a speck
+SPECK_GAP = 0.1  # distance between pieces, in extents of the largest one, above which they are not of one thing
+SPECK_CELLS = 512  # greatest number of cells along a side, on which pieces are sought
+MOST_SPECKS = 5  # specks that are named with their places
 log = logging.getLogger("factorlib.labels")
 
 
@@ -176,31 +174,24 @@ def check_materials(
             raise InputError(fault, file=path, key=f"{key}[{members[0]}].materials", cure=cure)
 
 
-def warn_of_strays(inside: Bool[np.ndarray, "h w"], path: Path, key: str) -> None:
-    """Name small pieces of a mask far from its largest one in a warning: specks are no part of the thing.
-
-    Args:
-        inside: The mask.
-        path: File to name.
-        key: Key to name.
-    """
+def describe_specks(inside: Bool[np.ndarray, "h w"]) -> str:
+    """Name the small pieces of a mask that lie far from all others, with their places; "" for none."""
     # number of pixels of the mask in each cell, and the extent of the largest piece of touching cells
-    cell = -(-max(inside.shape) // STRAY_CELLS)
+    cell = -(-max(inside.shape) // SPECK_CELLS)
     rows, columns = (np.arange(0, length, cell) for length in inside.shape)
     counts = np.add.reduceat(np.add.reduceat(inside, rows, axis=0, dtype=np.uint16), columns, axis=1, dtype=np.int64)
     pieces, _ = ndimage.label(counts, np.ones((3, 3)))
     largest = pieces == np.bincount(pieces.ravel(), counts.ravel()).argmax()
-    reach = STRAY_GAP * (np.ptp(np.argwhere(largest), axis=0).max() + 1)
-    # groups of pieces nearer to each other than STRAY_GAP extents; 0 is the background
+    reach = SPECK_GAP * (np.ptp(np.argwhere(largest), axis=0).max() + 1)
+    # groups of pieces nearer to each other than SPECK_GAP extents; 0 is the background
     groups, _ = ndimage.label(ndimage.distance_transform_edt(counts == 0) <= reach / 2)
     areas = np.bincount(groups.ravel(), counts.ravel())
-    strays = np.flatnonzero((areas < STRAY_SHARE * areas.max()) & (areas > 0))
-    if len(strays):
-        centres = np.multiply(ndimage.center_of_mass(counts, groups, strays), cell).round().astype(int).tolist()
-        named = ", ".join(f"{areas[k]:.0f} px at ({x}, {y})" for k, (y, x) in zip(strays, centres[:MOST_STRAYS]))
-        log.warning(
-            "%s: %s: %d small pieces far from the thing: %s; erase what is no part of it", path, key, len(strays), named
-        )
+    specks = np.flatnonzero((areas < SPECK_SHARE * areas.max()) & (areas > 0))
+    if not len(specks):
+        return ""
+    centres = np.multiply(ndimage.center_of_mass(counts, groups, specks), cell).round().astype(int).tolist()
+    named = ", ".join(f"{areas[k]:.0f} px at ({x}, {y})" for k, (y, x) in zip(specks, centres[:MOST_SPECKS]))
+    return f"specks far from the thing ({len(specks)}): {named}; erase what is no part of it"
 
 
 def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:

@@ -27,6 +27,7 @@ from factorlib.images.photo import box_majority, decode_photo, least_factor, ope
 from factorlib.images.picture import picture, write_png
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
+from factorlib.labels.label_image import describe_specks
 from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
 from factorlib.onboarding.photo_folder import Cameras
@@ -67,12 +68,14 @@ class View(msgspec.Struct, frozen=True):
         size: height and width of the photo's file as displayed
         doubt: doubt of the matte, 0 for a mask that no network made
         pixels: the small photo, sRGB-encoded; None where no network made the mask
+        specks: small pieces of the mask far from the thing, in words
     """
 
     small: PhotoForMotion
     size: tuple[int, int]
     doubt: float
     pixels: UInt8[np.ndarray, "h w 3"] | None
+    specks: str = ""
 
     def outline(self, name: str, image: SourceImage, focal: float | None = None) -> Outline:
         """Return the outline of the foreground with the camera of a source; `focal` replaces its focal length."""
@@ -165,7 +168,11 @@ def read_views(
         prior = with_prior_focal(camera, photo.focal_px, "exif")
         grey = pixels.mean(axis=2).astype(np.uint8)
         views[name] = View(
-            PhotoForMotion(grey, objects, np.zeros_like(objects), *prior), opened.size, uncertain, matted
+            PhotoForMotion(grey, objects, np.zeros_like(objects), *prior),
+            opened.size,
+            uncertain,
+            matted,
+            describe_specks(mask),
         )
     if not any(view.small.objects.any() for view in views.values()):
         raise InputError("no photo has a foreground", file=path.parent, key="PHOTOS", cure=NO_FOREGROUND)
@@ -396,4 +403,5 @@ def doubtful_masks(views: Mapping[str, View], outlines: list[Outline]) -> list[s
         "it differs from what the other photos show": differing(agreements_of(outlines)),
     }
     line = "draw over the mask of {} in `make label`: {}"
-    return [line.format(", ".join(names), why) for why, names in groups.items() if names]
+    specks = [f"mask of {name}: {view.specks}" for name, view in views.items() if view.specks]
+    return specks + [line.format(", ".join(names), why) for why, names in groups.items() if names]
