@@ -180,7 +180,7 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
     check_plain(path, "a picture", key)
     with (
         warnings.catch_warnings(action="ignore"),  # of metadata
-        reading("a picture", path, key, "save the mask again, as PNG"),
+        reading("a picture", path, key, "save the mask again, as PNG; of a Cryptomatte the matte of each material"),
         Image.open(path, formats=FORMATS) as image,
     ):
         size = size or image.size[::-1]

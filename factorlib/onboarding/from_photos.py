@@ -205,7 +205,8 @@ def cameras_of_folder(
     if content and not any(key in lens for lens in (content, *content["frames"]) for key in FOCAL_KEYS):
         height, width = next(iter(views.values())).size
         file = folder / cameras.files[0].name
-        content |= {"fl_x": 2.0 * max(width, height), "w": width, "h": height}
+        posed = [frame for frame in content["frames"] if frame.get("transform_matrix")]
+        content |= {"fl_x": 2.0 * max(width, height), "w": width, "h": height, "frames": posed}
         write_json(file, content)
         cameras = Cameras({"transforms": f"cameras/{file.name}"}, folder, [file])
         images = match_source(paths, cameras)
