@@ -90,9 +90,8 @@ def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None)
     if picture.opaque is not None:
         return picture.opaque
     values = _values(picture, path, key)
-    return (
-        values > (LEFT_OUT if picture.lossy else values.max()) // 2
-    )  # in the values' own type, of which twice the greatest may be no number
+    # in the values' own type, of which twice the greatest may be no number
+    return values > (LEFT_OUT if picture.lossy else values.max()) // 2
 
 
 def read_labels_in(path: str | Path, key: str, size: tuple[int, int] | None = None) -> set[int]:
@@ -418,14 +417,11 @@ def read_coco(
         name = names.get(annotation.category_id)
         if name is None:
             fault = f"category_id is {annotation.category_id!r}, but categories has no such id"
-            raise InputError(
-                fault, file=path, key=f"annotations[{index}]", cure="add the category, or correct category_id"
-            )
+            raise InputError(fault, file=path, key=f"annotations[{index}]", cure="add it, or correct category_id")
         if name not in materials:
             cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
-            raise InputError(
-                f"category {name!r} is not a material", file=path, key=place.removesuffix(".segmentation"), cure=cure
-            )
+            fault = f"category {name!r} is not a material"
+            raise InputError(fault, file=path, key=place.partition(".")[0], cure=cure)
         segmentations.setdefault(name, []).append((place, annotation.segmentation))
     masks = {}
     length = 0.0  # of all outlines

@@ -167,13 +167,8 @@ def read_views(
         camera = Camera(photo.width, photo.height, 1.0, (photo.width / 2, photo.height / 2))
         prior = with_prior_focal(camera, photo.focal_px, "exif")
         grey = pixels.mean(axis=2).astype(np.uint8)
-        views[name] = View(
-            PhotoForMotion(grey, objects, np.zeros_like(objects), *prior),
-            opened.size,
-            uncertain,
-            matted,
-            describe_specks(mask),
-        )
+        small = PhotoForMotion(grey, objects, np.zeros_like(objects), *prior)
+        views[name] = View(small, opened.size, uncertain, matted, describe_specks(mask))
     if not any(view.small.objects.any() for view in views.values()):
         raise InputError("no photo has a foreground", file=path.parent, key="PHOTOS", cure=NO_FOREGROUND)
     return views

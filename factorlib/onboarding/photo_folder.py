@@ -78,17 +78,8 @@ def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict
     images = [*named.values()] or [p for p in photos if p in full and not p.parent.name] or full.intersection(photos)
     # masks that transforms.json names, or that are called as a photo
     paired = {image: mask for name, image in named.items() if (mask := frames[name]) in places}
-    pairs = _namesakes({p: photos[p] for p in images if p not in paired}, {p: masks[p] for p in masks if p in full})
-    times = Counter(path for pair in pairs for path in pair)
-    for photo, mask in pairs:
-        if times[photo] > 1 or times[mask] > 1:
-            raise InputError(
-                f"it is not clear whether it is the mask of {photo}: there are others of this name",
-                file=folder / mask,
-                key="PHOTOS",
-                cure="put masks into subfolders as the photos are, masks/<folder>/<photo>.png, one for each photo",
-            )
-    paired |= dict(pairs)
+    unpaired = {p: photos[p] for p in images if p not in paired}
+    paired |= _pair(unpaired, {p: masks[p] for p in masks if p in full}, folder)
     if gone := [name for name, image in named.items() if frames[name] and image not in paired]:
         raise InputError(
             f"there is no picture '{frames[gone[0]]}'",
@@ -145,6 +136,23 @@ def _namesakes(
         for other in nearest_paths(one, right)
         if one in nearest_paths(other, left)
     ]
+
+
+def _pair(
+    photos: Mapping[PurePosixPath, str], masks: Mapping[PurePosixPath, str], folder: Path
+) -> dict[PurePosixPath, PurePosixPath]:
+    """Return the mask of each photo that has one, from stems by path; InputError where several are possible."""
+    pairs = _namesakes(photos, masks)
+    times = Counter(path for pair in pairs for path in pair)
+    for photo, mask in pairs:
+        if times[photo] > 1 or times[mask] > 1:
+            raise InputError(
+                f"it is not clear whether it is the mask of {photo}: there are others of this name",
+                file=folder / mask,
+                key="PHOTOS",
+                cure="put masks into subfolders as the photos are, masks/<folder>/<photo>.png, one for each photo",
+            )
+    return dict(pairs)
 
 
 def _beside(file: Path, path: str) -> PurePosixPath:
