@@ -1,14 +1,15 @@
 """Validation of files before anything runs: photos against masks, meshes against parts, and files of recipes.
 
 The checks are those that stages make first, by the same functions, and the consistency of materials in masks and
-dataset.yaml.  Of a photo, the header and the first and last row are read.  The runner loads this module by name, as it loads stages.  It knows no
-science, and a run with nothing to do must not import any.
+dataset.yaml.  Of a photo, the header and the first and last row are read.  The runner loads this module by name, as it
+loads stages.  It knows no science, and a run with nothing to do must not import any.
 """
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ class Validation:
         faults = _faults(check for name, check in checks.items() if name not in self._done)
         self._done |= checks.keys()
         with ThreadPoolExecutor() as threads:
-            faults += sum(threads.map(lambda check: _faults([check]), self._pixels), [])
+            faults += chain.from_iterable(threads.map(lambda check: _faults([check]), self._pixels))
         self._pixels.clear()
         return faults
 
