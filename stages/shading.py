@@ -23,10 +23,10 @@ from factorlib.urm.extract import read_geometry
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Reflection operator."""
+    """Parameters of the shading."""
 
     operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
-    """Reflection operator."""
+    """Operator that reflects the lights; network: the fitted one (`factorlib.reflection`)."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:

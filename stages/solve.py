@@ -180,7 +180,7 @@ def _share(progress: Progress, done: float, total: float, text: str = "") -> Non
 def _build_problem(
     params: Params, inputs: Inputs, declared: KnownSlice, observations: urm.Observations, relative: dict[str, float]
 ) -> JointProblem:
-    """Return the problem: blocks of observations at one exposure, operator, loss and known quantities.
+    """Return the problem: blocks of observations at one exposure, operator and known quantities.
 
     Args:
         params: Parameters of the stage.

@@ -32,9 +32,15 @@ from factorlib.inference.optimizer import Descent, DescentState
 
 
 def balance_exposures(state: DescentState, descent: Descent, known: KnownValues) -> DescentState:
-    """Return the state after the move (1) that the priors favour.
+    """Return the state after the move (1) that the priors favour, if it lowers the objective.
 
-    Components with known materials or lights, and those of one group, stay as they are.
+    With interreflection the move changes the predicted radiance, so the whole objective decides.  Components with known
+    materials or lights, and those of one group, stay as they are.
+
+    Args:
+        state: State with the value of the objective there (`Descent.linearise`).
+        descent: Descent of materials and lights.
+        known: Known values.
     """
     theta = state.theta
     blocks = [likelihood.illumination.block for likelihood in state.likelihoods]
@@ -70,7 +76,8 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
 
     moved, log_factors = move(minimize(energy, np.zeros(len(moving)), jac=True).x)
     materials = materials_from_unknowns(moved)
-    return descent.linearise([term.moved(log_factors, materials) for term in terms], moved)
+    balanced = descent.linearise([term.moved(log_factors, materials) for term in terms], moved)
+    return balanced if balanced.value < state.value else state
 
 
 class ExposureTerms:

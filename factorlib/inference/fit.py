@@ -22,6 +22,7 @@ more to all observations: rims and thin parts show directions that nothing else 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -75,12 +76,14 @@ class Fit(msgspec.Struct, frozen=True):
         hyperparameters: Weights of each light's observations and prior.
         value: Objective, (1) of `factorlib.inference.optimizer`.
         light_values: Part of each light in it: minus twice its log marginal likelihood.
+        fitted: True if a descent led to the point; False for a first guess.
     """
 
     point: Point
     hyperparameters: list[Hyperparameters]
     value: float = float("inf")
     light_values: list[float] = []
+    fitted: bool = False
 
     def with_lights(self, lights: list[Light]) -> Fit:
         """Return the start of another fit, in other lights."""
@@ -139,8 +142,9 @@ def fit_problem(
     materials = start.point.materials
     if not schedule.materials_fixed:
         materials = problem.known.insert_into(raise_reflectances(materials))
-    prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
-    descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
+    # a first guess descends without ε: classes of one tint, such as fabrics, would hold both parts at one
+    material_prior = partial(MaterialPrior, materials, problem.blocks, problem.known)
+    descent = Descent(material_prior(one_tint=start.fitted), problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
     with_table = partial(light_likelihood, prior=prior, materials_given=schedule.materials_fixed, tables=problem.tables)
     pairs = list(zip(illuminations, hyperparameters, strict=True))
@@ -148,6 +152,8 @@ def fit_problem(
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
     estimate = partial(estimate_hyperparameters, least=schedule.least_temperature, factor=schedule.temperature_factor)
     for number, iterations in enumerate(schedule.descents):
+        if number == 1:
+            descent = msgspec.structs.replace(descent, prior=material_prior())
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
             solved = list(zip(state.likelihoods, state.systems, strict=True))
@@ -156,6 +162,7 @@ def fit_problem(
         if schedule.materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
+            state = descent.linearise(state.likelihoods, state.theta)
             state = descent.descend_jointly(balance_exposures(state, descent, problem.known), iterations)
             state = balance_exposures(state, descent, problem.known)
     if not schedule.materials_fixed:
@@ -165,7 +172,7 @@ def fit_problem(
     if schedule.materials_fixed:  # those are φ
         light_values = list(map(LightLikelihood.marginal, state.likelihoods, state.systems))
     value = sum(light_values) + state.prior.value
-    return Fit(Point(materials, lights), hyperparameters, value, light_values)
+    return Fit(Point(materials, lights), hyperparameters, value, light_values, True)
 
 
 def light_likelihood(
@@ -193,36 +200,39 @@ def light_likelihood(
         ground = cast_shadows(shadows, *arguments[1:])
     else:
         ground = None
-    return with_hyperparameters(
-        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, FIT_LOSS, ground),
-        hyperparameters,
-    )
+    log_peaks = np.log(illumination.light.peaks)
+    terms = hyperparameter_terms(illumination, prior, hyperparameters)
+    return LightLikelihood(tabulated, prior, log_peaks, loss=FIT_LOSS, ground=ground, **terms)
 
 
 def with_hyperparameters(likelihood: LightLikelihood, hyperparameters: Hyperparameters) -> LightLikelihood:
     """Return the likelihood with other hyperparameters."""
-    light = likelihood.light
+    terms = hyperparameter_terms(likelihood.illumination, likelihood.prior, hyperparameters)
+    return msgspec.structs.replace(likelihood, **terms)
+
+
+def hyperparameter_terms(
+    illumination: Illumination, prior: LightPrior, hyperparameters: Hyperparameters
+) -> dict[str, Any]:
+    """Return m, Q, log det Q and T, the fields of `LightLikelihood` that hyperparameters determine."""
+    light = illumination.light
     # Q of the cells, under the scale factors s_k²
-    Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], hyperparameters.factors)
+    Q, log_determinant = prior.precision(light.axis[~light.suns], hyperparameters.factors)
     if light.suns.any():  # the prior on cells does not cover suns: each has an independent Gaussian
         is_sun = np.tile(light.suns, 3)
         cells = Q
         Q = np.diag(np.where(is_sun, SUN_DEVIATION**-2.0, 0.0))
         Q[np.ix_(~is_sun, ~is_sun)] = cells
+        log_determinant -= 2 * int(is_sun.sum()) * float(np.log(SUN_DEVIATION))
     if light.fixed.any():  # Q of the free cells given the fixed ones is their block of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
     mean = np.zeros(len(Q))
-    background = likelihood.illumination.block.background
+    background = illumination.block.background
     if background is not None and not light.fixed.any():
         mean, Q, log_determinant = condition_on_background(Q, background, light)
-    counts = {
-        "mean": mean,
-        "precision": Q,
-        "log_determinant": log_determinant,
-        "temperature": hyperparameters.temperature,
-    }
-    return msgspec.structs.replace(likelihood, log_peaks=np.log(light.peaks), **counts)
+    temperature = hyperparameters.temperature
+    return {"mean": mean, "precision": Q, "log_determinant": log_determinant, "temperature": temperature}
 
 
 def estimate_hyperparameters(

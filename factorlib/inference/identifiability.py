@@ -21,7 +21,7 @@ from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.observed import PhotoObservations
 from factorlib.inference.problem import JointProblem
 
-FEW_OBSERVATIONS = 40  # observations: a few for each of 7 unknowns of a material and some lobes of 6
+FEW_OBSERVATIONS = 40  # observations: a few for each of 7 unknowns of a material and for the light that it mirrors
 LEAST_SPREAD_DEG = 15.0  # mirror directions within this angle of their mean show one patch of the light
 CLIPPED = 0.5  # share of clipped channel values
 ROUGHNESS_ERROR = 0.1  # largest standard error that still separates dull from glossy

@@ -165,11 +165,11 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             slope[: by_cells.size] += by_cells.T.reshape(-1)
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
-    def normal_equations(self, posterior: bool = False, groupings: Sequence[Grouping] = ()) -> System:
+    def normal_equations(self, determinants: bool = True, groupings: Sequence[Grouping] = ()) -> System:
         """Return the value of (1) and its normal equations.
 
         Args:
-            posterior: True to return φ instead of (1), without the costly derivatives of the determinants.
+            determinants: False for φ instead of (1), without the determinants and their costly derivatives.
             groupings: Groups of observations, for `System.scores`.
         """
         illumination = self.illumination
@@ -206,7 +206,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / self.temperature
-        if not posterior:
+        if determinants:
             value += self._determinants(factor)
             determinant = _determinant_derivatives(parts, factor, places, illumination)
         scores = tuple(_scores(parts, grouping, places, size) for grouping in groupings)

@@ -13,8 +13,8 @@ differ, so that metals and fabrics are then less likely than π.  For example, k
 metal, and k_s = 0.2 at roughness 1 a fabric.  Where the user names a material's class, that one alone has a share.
 
 μ_c, S_c, τ_c and ε_c are those of measured materials (`studies.measured.material_classes`, material_classes.json).
-They are widened by the unknown scale of reflectances and the unknown white balance of photos (`SCALE_DEVIATION`,
-`CLASS_ROUGHNESS_DEVIATION`, `WHITE_DEVIATION`).
+All but ε_c are widened by the unknown scale of reflectances and the unknown white balance of photos
+(`SCALE_DEVIATION`, `CLASS_ROUGHNESS_DEVIATION`, `WHITE_DEVIATION`).
 
 Let r_c be the share of class c in the sum (1).  Half the gradient of −2 log p is the mean of the classes' under r_c.
 Half the Hessian is approximated by the mean of their precisions, JᵀJ/ε_c² for e, the Hessian of the bound of
@@ -138,11 +138,10 @@ class Mixture:
         covariances = [np.array(material_class.covariance) + slack for material_class in classes]
         self.mean = np.array([[material_class.mean[0]] * 3 + [material_class.mean[1]] for material_class in classes])
         self.precision = np.zeros((len(classes), 4, 4))
-        # τ², and 1/ε² of each class
-        noise = WHITE_DEVIATION**2 + relative**2
-        tints = np.array([material_class.tint**2 + noise for material_class in classes])
+        # τ², and 1/ε² of each class; e, a difference of two tints, does not depend on white balance
+        tints = np.array([material_class.tint**2 + WHITE_DEVIATION**2 + relative**2 for material_class in classes])
         differences = [material_class.tint_difference if one_tint else None for material_class in classes]
-        self.difference = np.array([0.0 if each is None else 1 / (each**2 + noise) for each in differences])
+        self.difference = np.array([0.0 if each is None else 1 / (each**2 + relative**2) for each in differences])
         # precision of (log k_s, roughness), [4, 4] a class, but for e
         for P, covariance, variance in zip(self.precision, covariances, tints, strict=True):
             inverse = np.linalg.inv(covariance)
@@ -195,13 +194,21 @@ class MaterialPrior:
 
     The start is that of the present fit, so the wide Gaussian about it moves from fit to fit.  Materials without a
     specular part at the start have no prior on it.
+
+    Args:
+        start: Materials at the start.
+        blocks: Observations by illumination.
+        known: Known values.
+        one_tint: False to leave out ε of (1).
     """
 
-    def __init__(self, start: Materials, blocks: Sequence[Block], known: KnownValues = KnownValues()):
+    def __init__(
+        self, start: Materials, blocks: Sequence[Block], known: KnownValues = KnownValues(), one_tint: bool = True
+    ):
         self.mean = material_unknowns(start)
         self.wide = np.array([DIFFUSE_DEVIATION**-2.0] * 3 + [0.0] * 3 + [ROUGHNESS_DEVIATION**-2.0])
         self.specular = np.flatnonzero((start.specular > LEAST_REFLECTANCE).any(1)).tolist()
-        self.mixtures = [Mixture(classes_of(known.classes.get(m))) for m in range(len(start))]
+        self.mixtures = [Mixture(classes_of(known.classes.get(m)), one_tint=one_tint) for m in range(len(start))]
         self.members = [
             list(members)
             for members, lights in connected_components(blocks, len(start))

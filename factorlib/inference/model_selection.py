@@ -170,7 +170,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     def fit_best(name: str, with_shadows: bool, with_bounces: bool, first_fits: list[Fit]) -> tuple[Fit, Losses]:
         """Return the best fit of one model from several starts, and its losses."""
         model = sample.with_effects(with_shadows, with_bounces)
-        fits = [run_fit(name, model, fit, CONTINUED_TRIAL if np.isfinite(fit.value) else TRIAL) for fit in first_fits]
+        fits = [run_fit(name, model, fit, CONTINUED_TRIAL if fit.fitted else TRIAL) for fit in first_fits]
         results = [(fit, held_out_losses(model, fit.point)) for fit in fits]
         return min(results, key=lambda result: _log_geometric_mean(result[1]))
 

@@ -158,7 +158,6 @@ class Descent(msgspec.Struct, frozen=True):
 
         Each step costs one factorisation, also a rejected one.
         """
-        state = self.linearise(state.likelihoods, state.theta)
         damping = 0.0
         for _ in range(iterations):
             trial = self.linearise(*self._step(state, damping))
@@ -196,6 +195,7 @@ class Descent(msgspec.Struct, frozen=True):
         for system in state.systems:
             gradient[system.places] += system.material_gradient
         free = self.free & ~outward_mask(state.theta.reshape(-1), -gradient)
+        limits = [material_limits(state.theta, free), *(light_limits(each.light) for each in state.likelihoods)]
         # H with D and the damping μ
         arrow = Arrow(state.systems, state.prior.hessian + hessian, free, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
@@ -204,8 +204,7 @@ class Descent(msgspec.Struct, frozen=True):
         def apply_step(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
             """Return θ and the lights after a step of all unknowns."""
             material_step, *light_steps = np.split(step, ends)
-            change = material_step.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
-            theta = (state.theta + change).clip(LOWER_BOUNDS, UPPER_BOUNDS)
+            theta = (state.theta + material_step.reshape(-1, 7)).clip(LOWER_BOUNDS, UPPER_BOUNDS)
             materials = materials_from_unknowns(theta)
             steps = zip(state.likelihoods, light_steps, strict=True)
             return theta, [old.with_point(step_light(old.light, step), materials) for old, step in steps]
@@ -219,7 +218,6 @@ class Descent(msgspec.Struct, frozen=True):
             value = prior.value + sum(part.value for part in parts) + off @ (2 * by_determinant + penalty @ off)
             slope = prior.gradient + by_determinant + penalty @ off
             slope = slope + sum(part.by_materials for part in parts).reshape(-1)
-            slope[~free] = 0.0
             return value, np.concatenate([slope, *(part.by_light for part in parts)])
 
         def metric(slope: np.ndarray) -> np.ndarray:
@@ -228,9 +226,7 @@ class Descent(msgspec.Struct, frozen=True):
             step, lights = arrow.solve(material_slope, light_slopes)
             return np.concatenate([step, *lights])
 
-        theta, likelihoods = apply_step(
-            minimise_lbfgs(objective, ends[-1] + len(state.systems[-1].light_gradient), metric)
-        )
+        theta, likelihoods = apply_step(minimise_lbfgs(objective, np.hstack(limits), metric))
         return likelihoods, theta
 
 
@@ -241,12 +237,19 @@ def outward_mask(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
     return lower | upper
 
 
+def material_limits(theta: Float[np.ndarray, "m 7"], free: Bool[np.ndarray, " k"]) -> Float[np.ndarray, "2 k"]:
+    """Return lower and upper limits of a step of the material unknowns; those that are not `free` do not move."""
+    change = free.reshape(-1, 7) * LARGEST_CHANGE
+    limits = np.maximum(-change, LOWER_BOUNDS - theta), np.minimum(change, UPPER_BOUNDS - theta)
+    return np.reshape(limits, (2, theta.size))
+
+
 def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
     """Minimise φ over one light with the materials fixed; return its likelihood and normal equations at the minimum.
 
     There are at most `iterations` minimisations by L-BFGS, each preconditioned by one factorisation of H.
     """
-    system = likelihood.normal_equations(posterior=True)
+    system = likelihood.normal_equations(determinants=False)
     for _ in range(iterations):
 
         def objective(step: np.ndarray, start: LightLikelihood = likelihood) -> tuple[float, np.ndarray]:
@@ -258,10 +261,10 @@ def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLi
             """Return H⁻¹ times a gradient."""
             return solve_cholesky(factor, slope)
 
-        step = minimise_lbfgs(objective, len(system.light_gradient), metric)
+        step = minimise_lbfgs(objective, light_limits(likelihood.light), metric)
         likelihood = likelihood.with_point(step_light(likelihood.light, step))
         previous = system.value
-        system = likelihood.normal_equations(posterior=True)
+        system = likelihood.normal_equations(determinants=False)
         if previous - system.value < TOLERANCE * abs(previous):
             break
     return likelihood, system
@@ -291,21 +294,25 @@ def gauge_projection(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
 
 
 def minimise_lbfgs(
-    objective: Objective, size: int, metric: Callable[[np.ndarray], np.ndarray]
+    objective: Objective, limits: Float[np.ndarray, "2 n"], metric: Callable[[np.ndarray], np.ndarray]
 ) -> Float[np.ndarray, " n"]:
-    """Minimise a function by L-BFGS and return the step from 0.
+    """Minimise a function within limits by projected L-BFGS and return the step from 0.
+
+    Unknowns at a limit that the gradient would push beyond it do not take part in a step.
 
     Args:
         objective: Function that returns the value and half the gradient.
-        size: Number of unknowns.
+        limits: Lower and upper limits of the unknowns, about 0.
         metric: Product of a vector with the approximate inverse of half the Hessian.
     """
-    x = np.zeros(size)
+    lower, upper = limits
+    x = np.zeros(len(lower))
     value, gradient = objective(x)
     pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
     least = 0.0
     for _ in range(LBFGS_STEPS):
-        direction = -inverse_hessian_times(gradient, pairs, metric)
+        free = np.where(gradient > 0, x > lower, x < upper)
+        direction = free * -inverse_hessian_times(free * gradient, pairs, metric)
         decrement = -float(gradient @ direction)
         least = least or max(DECREMENT, DECREMENT_SHARE * decrement)
         if decrement < least:
@@ -315,15 +322,15 @@ def minimise_lbfgs(
         length = 1.0
         # backtracking line search (Armijo); the gradient is half the true one
         while length > SHORTEST:
-            trial = x + length * direction
+            trial = (x + length * direction).clip(lower, upper)
             trial_value, trial_gradient = objective(trial)
-            if trial_value <= value + 2 * SUFFICIENT * length * slope:
+            if trial_value <= value + 2 * SUFFICIENT * min(float(gradient @ (trial - x)), 0.0):
                 break
             # minimum of the parabola through both values and the slope
             length *= float(np.clip(-slope * length / max(trial_value - value - 2 * slope * length, 1e-300), 0.1, 0.5))
         else:
             break
-        if (change := trial_gradient - gradient) @ direction > 0:
+        if (change := trial_gradient - gradient) @ (trial - x) > 0:
             pairs.append((trial - x, change))
         x = trial
         value = trial_value
@@ -362,15 +369,25 @@ def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (ar
     return q
 
 
+def light_limits(light: Light) -> Float[np.ndarray, "2 l"]:
+    """Return lower and upper limits of a step of a light's unknowns: tone exponents stay within their range."""
+    limits = np.tile([[-np.inf], [np.inf]], light.unknowns)
+    first = 3 * int(light.free.sum()) + light.free_exposures
+    limits[:, first : first + len(light.log_tone)] = np.log(TONE_RANGE)[:, None] - light.log_tone
+    return limits
+
+
 def step_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
-    """Return the light after a step of its unknowns, with tone exponents within their range."""
+    """Return the light after a step of its unknowns."""
     counts = 3 * int(light.free.sum()), light.free_exposures, len(light.log_tone)
     cells, exposures, tones, scale = np.split(step, np.cumsum(counts))
     brighter = np.ones((len(light), 3))
     brighter[light.free] = np.exp(cells.reshape(3, -1).T)
     brighter[~light.free] = np.exp(scale.sum())
     exposures = np.concatenate([np.zeros(len(light.log_exposure) - len(exposures)), exposures])
-    tone = np.clip(light.log_tone + tones, *np.log(TONE_RANGE))
     return msgspec.structs.replace(
-        light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone
+        light,
+        weight=light.weight * brighter,
+        log_exposure=light.log_exposure + exposures,
+        log_tone=light.log_tone + tones,
     )

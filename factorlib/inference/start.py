@@ -68,7 +68,7 @@ def start_from_photos(materials: int) -> Start:
 
 
 class InitialLight(msgspec.Struct, frozen=True):
-    """Light on the first p of `rotated_cells`.
+    """Light on p `rotated_cells`.
 
     Attributes:
         weight: Weights of the cells, RGB, in scene radiance.
@@ -87,12 +87,10 @@ class InitialFit(msgspec.Struct, frozen=True):
     Attributes:
         materials: k_d, k_s (RGB each) and roughness, by number.
         lights: Lights by illumination.
-        value: Objective of the fit.
     """
 
     materials: list[list[float]]
     lights: dict[str, InitialLight]
-    value: float
 
     @staticmethod
     def from_fit(fit: Fit, blocks: Sequence[Block]) -> InitialFit:
@@ -104,14 +102,14 @@ class InitialFit(msgspec.Struct, frozen=True):
             block.name: InitialLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
             for block, light, hyperparameters in zip(blocks, fit.point.lights, fit.hyperparameters, strict=True)
         }
-        return InitialFit(fit.point.materials.rows().tolist(), lights, fit.value)
+        return InitialFit(fit.point.materials.rows().tolist(), lights)
 
 
 def start_from_surface(initial: InitialFit) -> Start:
     """Return the start from a fit.
 
-    A light with other cells or other photos than the fit's is constant, and the start then counts as no fit: its value
-    is infinite, and it is descended from as from mean radiances.
+    A light with other cells or other photos than the fit's is constant, and the start then counts as a first guess, from
+    which to descend as from mean radiances.
     """
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
@@ -119,16 +117,16 @@ def start_from_surface(initial: InitialFit) -> Start:
         materials = Materials.from_rows(np.array(initial.materials))
         lights = [constant_light(block, materials, cells) for block in problem.blocks]
         hyperparameters = [Hyperparameters() for _ in lights]
-        value = initial.value
+        fitted = True
         for k, block in enumerate(problem.blocks):
             light = initial.lights.get(block.name)
             if light is None or (len(light.weight), len(light.log_exposure)) != (cells, len(block.photos)):
-                value = float("inf")
+                fitted = False
                 continue
             values = {"weight": np.array(light.weight) / block.unit, "log_exposure": np.array(light.log_exposure)}
             lights[k] = msgspec.structs.replace(lights[k], **values)
             hyperparameters[k] = light.hyperparameters
-        return [Fit(Point(materials, lights), hyperparameters, value)]
+        return [Fit(Point(materials, lights), hyperparameters, fitted=fitted)]
 
     return fits
 

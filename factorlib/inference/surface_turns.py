@@ -313,7 +313,7 @@ def linearise_light(
         residual[line.rows, line.channel] = line.residual
         by_factor[line.rows, line.channel] = line.by_material[:, 0]  # ∂r/∂log k_d
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
-    system = likelihood.normal_equations(posterior=True)
+    system = likelihood.normal_equations(determinants=False)
     whitened = illumination.block.residuals(prediction.radiance)
     weight = tabulated.root_weights(whitened, FIT_LOSS, hyperparameters.temperature)
     # J = [∂r/∂n R b, ∂r/∂log k_d b]

@@ -160,7 +160,7 @@ class Posterior:
             groupings = []
             if with_scores:
                 groupings = [Grouping(pair[0].block.clusters()), *normal_turns(likelihood)]
-            result = likelihood.normal_equations(posterior=True, groupings=groupings)
+            result = likelihood.normal_equations(determinants=False, groupings=groupings)
             self.tick()
             return result
 

@@ -90,6 +90,15 @@ def test_a_balance_predicts_the_same_radiance_and_lowers_the_objective():
     np.testing.assert_allclose(again.theta, after.theta, atol=1e-3)
 
 
+def test_a_balance_that_interreflection_makes_worse_is_not_taken():
+    """Bounced light keeps its radiance, so that the move changes the prediction."""
+    problem = lamps()
+    rng = np.random.default_rng(0)
+    bounced = [msgspec.structs.replace(b, bounced=3 * rng.random((len(b), 6))) for b in problem.blocks]
+    before, descent = state_of(problem.with_blocks(bounced), (1.2, 0.9))
+    assert balance_exposures(before, descent, KnownValues()).value <= before.value
+
+
 def test_materials_of_one_photo_or_of_known_exposures_are_one_group_and_stay():
     problem = spheres([on_even_cells(drawn(1, CELLS))])
     assert len(set(material_groups(problem.blocks, 3, KnownValues()))) == 1

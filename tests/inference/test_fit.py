@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from factorlib.images import tone
 from factorlib.inference.blocks import Noise
 from factorlib.inference.fit import (
     DARK_NOISE,
@@ -18,13 +19,14 @@ from factorlib.inference.fit import (
     reliable_observations,
 )
 from factorlib.inference.joint_solver import LIGHTS
-from factorlib.inference.lights import Light
+from factorlib.inference.lights import TONE_RANGE, Light
 from factorlib.inference.likelihood import cholesky_factor
 from factorlib.inference.material_prior import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, MaterialPrior, material_unknowns
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.optimizer import Arrow, Descent, determinant_terms
+from factorlib.inference.optimizer import Arrow, Descent, descend_light, determinant_terms
 from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve_paper
 from factorlib.inference.problem import JointProblem
+from factorlib.inference.start import constant_light
 from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block
 from tests.inference.made_lights import (
@@ -34,9 +36,11 @@ from tests.inference.made_lights import (
     START,
     WHOLE,
     begun,
+    drawn,
     light_of,
     likelihood,
     natural,
+    on_even_cells,
     photographed,
     spheres,
 )
@@ -206,6 +210,23 @@ def test_the_arrow_is_solved_as_the_dense_system_is():
     expected = np.zeros(ends[-1])
     expected[moving] = np.linalg.solve(dense[np.ix_(moving, moving)], right[moving])
     np.testing.assert_allclose(np.concatenate([step, *of_lights]), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("exponents", [(3.0, 1.0), (0.4, 2.5)])
+def test_an_unknown_at_its_bound_stops_no_other(exponents):
+    """Photos through tone curves beyond the bounds.  The light is at its minimum, given the exponents at their bounds."""
+    light = on_even_cells(drawn(30, 60), (0.0, 0.3))
+    (block,) = spheres([light], size=12, noise=0.05).blocks
+    toned = tone.curve(block.radiance, np.array(exponents)[block.photo][:, None])
+    block = msgspec.structs.replace(block, radiance=toned, inverse_sigma=1 / np.hypot(0.05, 0.05 * toned))
+    start = msgspec.structs.replace(constant_light(block, MATERIALS, 60), log_tone=np.zeros(2))
+    end, system = descend_light(likelihood(JointProblem([block], OPERATOR), start), 8)
+    low, high = np.log(TONE_RANGE)
+    inside = np.append(
+        np.ones(start.unknowns - 2, bool), np.abs(end.light.log_tone - (low + high) / 2) < 0.999 * (high - low) / 2
+    )
+    slope = system.light_gradient[inside]
+    assert not inside.all() and slope @ np.linalg.solve(system.light_hessian[np.ix_(inside, inside)], slope) < 1
 
 
 def test_where_a_descent_ends_the_likelihood_has_no_slope_left():

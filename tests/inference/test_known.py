@@ -144,16 +144,16 @@ def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_f
     problem, (true,) = photographed(5, 1, cells=30, size=10)
     fixed, curves = true.axis[:, 2] < 0, {"log_tone": np.array([0.1])}
     one = likelihood(problem, msgspec.structs.replace(true, fixed=fixed, scale_free=scale_free, **curves))
-    system = one.normal_equations(posterior=True)
+    system = one.normal_equations(determinants=False)
     step = np.random.default_rng(0).normal(size=one.light.unknowns)
     assert len(step) == 3 * (~fixed).sum() + 1 + scale_free == len(system.light_gradient)
     lights = [step_light(one.light, s * step) for s in (1e-3, -1e-3)]
-    ahead, behind = (one.with_point(light).normal_equations(posterior=True).value for light in lights)
+    ahead, behind = (one.with_point(light).normal_equations(determinants=False).value for light in lights)
     assert (ahead - behind) / 4e-3 == pytest.approx(system.light_gradient @ step, rel=1e-3)
     nothing = msgspec.structs.replace(problem, blocks=[problem.blocks[0].take(slice(0))])
     prior = likelihood(nothing, one.light)  # which is quadratic, so that its Hessian is no approximation
-    ahead, behind = (prior.with_point(light).normal_equations(posterior=True).light_gradient for light in lights)
-    hessian = prior.normal_equations(posterior=True).light_hessian
+    ahead, behind = (prior.with_point(light).normal_equations(determinants=False).light_gradient for light in lights)
+    hessian = prior.normal_equations(determinants=False).light_hessian
     np.testing.assert_allclose((ahead - behind) / 2e-3, hessian @ step, rtol=1e-6, atol=1e-8)
     free = np.tile(~fixed, 3)
     assert one.log_determinant == pytest.approx(np.linalg.slogdet(one.precision[np.ix_(free, free)])[1])

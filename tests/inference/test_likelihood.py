@@ -47,7 +47,7 @@ def log_det(one) -> float:
 
 def posterior(one) -> float:
     """φ."""
-    return one.normal_equations(posterior=True).loss / one.temperature + prior_of(one.light, one.precision)
+    return one.normal_equations(determinants=False).loss / one.temperature + prior_of(one.light, one.precision)
 
 
 def moved(light, step):
@@ -137,7 +137,7 @@ def test_darker_materials_in_a_brighter_light_are_as_likely_but_for_the_prior(he
 def settled(one, steps=15):
     """The likelihood at the light that lowers φ."""
     for _ in range(steps):
-        part, light = one.normal_equations(posterior=True), one.light
+        part, light = one.normal_equations(determinants=False), one.light
         one = one.with_point(moved(light, -np.linalg.solve(part.light_hessian, part.light_gradient).clip(-1, 1)))
     return one
 
@@ -309,6 +309,15 @@ def test_materials_are_of_the_class_that_they_look_like(material, name):
     theta = np.log([0.01] * 3 + material[0])
     result, probability = likeliest_class(np.append(theta, material[1]), 0.05, 0.02)
     assert result == name and probability > 0.8
+
+
+def test_the_tints_of_both_parts_differ_as_measured():
+    """White balance is the same for both, and widens nothing."""
+    tint = np.array([0.3, 0.0, -0.3])
+    for one in shipped_classes().classes[1:]:
+        mixture, grey = Mixture([one]), np.array([*[20.0] * 3, *[one.mean[0]] * 3, one.mean[1]])  # e is the tint of k_d
+        cost = mixture.evaluate(grey + np.append(tint, [0.0] * 4))[0] - mixture.evaluate(grey)[0]
+        assert cost == pytest.approx(tint @ tint / one.tint_difference**2, rel=1e-6)
 
 
 def test_a_rough_specular_part_of_the_complementary_tint_is_no_fabric():

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.inference import fit as fits
 from factorlib.inference import suns
 from factorlib.inference.fit import FitSchedule, fit_problem
 from factorlib.inference.fit_runner import FitRunner
@@ -15,7 +16,7 @@ from factorlib.inference.suns import WIDE_SHARPNESS, accept_sun, compare_illumin
 from factorlib.light.lobes import SUN, lobe_energy
 from factorlib.results.materials import Decision
 from factorlib.scenes.joint_problems import MATERIALS
-from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells, spheres
+from tests.inference.made_lights import FEW, PRIOR, begun, drawn, likelihood, on_even_cells, spheres
 
 TOWARDS = np.array([0.36, -0.48, -0.8])
 SUN_LOBE = UnitLobes(TOWARDS[None], np.array([SUN]))
@@ -44,6 +45,13 @@ def tried(irradiance: float, seed: int):
         for of in (SUN, WIDE_SHARPNESS)
     ]
     return [one, *(problem.illuminations(around.point)[0] for around in fits)]
+
+
+def test_the_determinant_of_the_prior_counts_suns(monkeypatch):
+    monkeypatch.setattr(fits, "SUN_DEVIATION", 0.5)
+    light = on_even_cells(drawn(1, 40)).with_lobes(SUN_LOBE, np.ones((1, 3)))
+    one = likelihood(spheres([light], size=6), light)
+    assert one.log_determinant == pytest.approx(np.linalg.slogdet(one.precision)[1])
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
