@@ -17,7 +17,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.images.exr import read_rgb_exr
 from factorlib.inference.background import Background, concatenate_backgrounds
-from factorlib.inference.blocks import Block, Noise
+from factorlib.inference.blocks import CLUSTER, Block, Noise
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.problem import Spread
 from factorlib.urm.extract import with_surface_normals
@@ -26,9 +26,6 @@ from factorlib.urm.reduction import merge
 
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
 Maps = Mapping[str, Float[np.ndarray, "h w 3"]]  # lat-long map, by the name of a photo
-
-
-HELD_OUT_CELL = 0.1  # side of the cells of mirror directions that are held out together
 
 
 class PhotoObservations(msgspec.Struct, frozen=True):
@@ -186,8 +183,8 @@ def _block(
     # radiance in units of the weighted mean
     unit = max(float(np.average(radiance.mean(1), weights=observations.weight)), 1e-30)
     scaled = radiance / unit
-    # whole cells of mirror directions are held out
-    held_out = held_out_by_cells(mirror_cells(given_normal, view, HELD_OUT_CELL), observations.material, share, seed)
+    # whole clusters of mirror directions are held out, so that no fitted observation has their errors
+    held_out = held_out_by_cells(mirror_cells(given_normal, view, CLUSTER), observations.material, share, seed)
     visibility = directions = None
     if observations.visibility is not None and (observations.visibility < 255).any():
         sphere = fibonacci_sphere(observations.visibility.shape[1])
@@ -233,7 +230,7 @@ def held_out_by_cells(
     """Return a mask of the held-out observations: all those of randomly chosen cells, but never all of a material.
 
     Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits a local error would
-    explain them as well as a lobe that the light needs.
+    explain them as well as a lobe that the light needs.  At least one cell is held out, unless the share is 0.
 
     Args:
         cell: Number of each observation's cell.
@@ -242,5 +239,7 @@ def held_out_by_cells(
         seed: Seed of the random choice.
     """
     names, number = np.unique(cell, return_inverse=True)
-    is_held_out = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]
-    return is_held_out & np.isin(material, material[~is_held_out])
+    is_held_out = (np.random.default_rng(seed).permutation(len(names)) < share * len(names))[number.reshape(-1)]
+    # cells that show a material which no other cell shows are fitted
+    is_needed = ~np.isin(material, material[~is_held_out])
+    return is_held_out & ~np.isin(cell, cell[is_needed])

@@ -81,6 +81,16 @@ def test_model_in_shadow_is_the_radiance_traced_in_bowls_by_brute_force(seed):
     assert ignored > 0.15 * data.radiance.mean() and error < 0.2 * ignored
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_no_cluster_is_both_held_out_and_fitted_and_every_material_is_fitted(seed):
+    """Else a fit would know the errors of what it is judged by."""
+    observed = bowls("room", rough_light(20))
+    rare = (observed.material == 2) & (observed.normal[:, 0] < 0.8)  # a material that few cells show
+    (data,) = blocks_of_observations(observed.take(~rare), Noise(), held_out=0.3, seed=seed)
+    assert not set(data.clusters()[data.held_out]) & set(data.clusters()[~data.held_out]) and data.held_out.any()
+    assert set(data.material[~data.held_out]) == {0, 1, 2}
+
+
 # ── what is linked, and the gauge ────────────────────────────────────────────────────────────────────────────────────
 
 
