@@ -1,7 +1,8 @@
 """Model choices that a scene needs, made in the model that gives the answer.
 
 effects     No shadows, shadows of the given meshes, or shadows with interreflection, on fewer observations and cells.
-            The first model is fitted from every start, the others from its result.  Shadows stay unless held-out
+            Shadows are fitted from every first guess.  Models with and without them continue from the best result, and
+            interreflection is compared from one start as well.  Shadows stay unless held-out
             observations are against them.  Interreflection needs shadows, and a marginal likelihood that supports it.
 background  The surroundings that photos show are observations of a light unless the objects are strongly against it.
 tone        Exponents of tone curves are freed for all photos.  A light keeps its curves under three conditions: the
@@ -15,9 +16,10 @@ roughness   With few materials, the start decides which local minimum a fit reac
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
 
-Shadows and tone curves compare two models that are fitted to the same observations with reliable normals, by
-held-out observations.  These are whole cells of mirror directions (`factorlib.inference.observed`).  Let a_i and b_i be
-the mean robust losses of light i without and with the richer part, and n_i the number of its held-out observations.
+Models that are compared are fitted from one start with the same number of steps: one that got more descent would seem
+better.  Shadows and tone curves compare two models that are fitted to the same observations with reliable normals, by
+held-out observations.  These are whole clusters of mirror directions (`factorlib.inference.observed`).  Let a_i and b_i
+be the mean robust losses of light i without and with the richer part, and n_i the number of its held-out observations.
 Then
 
     d = Σ_i n_i (log a_i − log b_i) / Σ_i n_i                                                                      (1)
@@ -158,7 +160,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
 
     Args:
         problem: Observations with reliable normals.
-        starts: Initial fits; the best result continues.
+        starts: First guesses, of which the best result continues, or one fit.
         options: Options of the user.
         run_fit: Function that fits a model.
     """
@@ -167,21 +169,25 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     shadows = options.self_shadowing if hidden else "off"
     bounces = options.interreflection if problem.has_bounces else "off"
 
-    def fit_best(name: str, with_shadows: bool, with_bounces: bool, first_fits: list[Fit]) -> tuple[Fit, Losses]:
-        """Return the best fit of one model from several starts, and its losses."""
+    def fit_best(name: str, with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
+        """Return the best fit of one model from the starts, and its losses."""
         model = sample.with_effects(with_shadows, with_bounces)
-        fits = [run_fit(name, model, fit, CONTINUED_TRIAL if fit.fitted else TRIAL) for fit in first_fits]
+        fits = [run_fit(name, model, fit, CONTINUED_TRIAL if fit.fitted else TRIAL) for fit in starts]
         results = [(fit, held_out_losses(model, fit.point)) for fit in fits]
         return min(results, key=lambda result: _log_geometric_mean(result[1]))
 
     if shadows == "off":
-        fit, _ = fit_best("no shadows", False, False, starts)
+        fit, _ = fit_best("no shadows", False, False)
         return SolveState(fit, fit)
     forced = bounces == "on"
-    fit, losses = fit_best("shadows and bounces" if forced else "shadows", True, forced, starts)
+    with_shadows = "shadows and bounces" if forced else "shadows", True, forced
+    compared = shadows == "auto" and not problem.none_held_out
+    if compared and not starts[0].fitted:  # both models continue from one fit
+        starts = [fit_best(*with_shadows)[0]]
+    fit, losses = fit_best(*with_shadows)
     decision = Decision(True)
-    if shadows == "auto" and not problem.none_held_out:
-        plain, plain_losses = fit_best("no shadows", False, False, [fit])
+    if compared:
+        plain, plain_losses = fit_best("no shadows", False, False)
         decision = compare_models(plain_losses, losses, CLEARLY_AGAINST)
         if not decision.accepted:
             return SolveState(plain, plain, decision)
@@ -297,8 +303,11 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
         light if has else msgspec.structs.replace(light, log_tone=np.zeros_like(light.log_exposure))
         for light, has in zip(start.point.lights, curved_before, strict=True)
     ]
-    curved = run_fit("tone curves", sample, start.with_lights(freed), TONE_SCHEDULE)
-    losses_without, losses_with = (held_out_losses(sample, fit.point) for fit in (start, curved))
+    plain, curved = (
+        run_fit("tone curves", sample, start.with_lights(lights), TONE_SCHEDULE)
+        for lights in (start.point.lights, freed)
+    )
+    losses_without, losses_with = (held_out_losses(sample, fit.point) for fit in (plain, curved))
     evidence = []
     for k, light in enumerate(curved.point.lights):
         decision = compare_models(losses_without.one_light(k), losses_with.one_light(k), CLEARLY_FOR)
@@ -307,10 +316,10 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
     if all(decision.accepted for decision in evidence):
         return Selection(curved, evidence)
     if not any(decision.accepted and not has for decision, has in zip(evidence, curved_before, strict=True)):
-        return Selection(start, evidence)
-    pairs = zip(curved.point.lights, start.point.lights, strict=True)
+        return Selection(plain, evidence)
+    pairs = zip(curved.point.lights, plain.point.lights, strict=True)
     mixed = [pair[0 if decision.accepted else 1] for pair, decision in zip(pairs, evidence, strict=True)]
-    return Selection(run_fit("tone curves", sample, start.with_lights(mixed), TONE_SCHEDULE), evidence)
+    return Selection(run_fit("tone curves", sample, plain.with_lights(mixed), TONE_SCHEDULE), evidence)
 
 
 def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
@@ -339,11 +348,7 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         """Return the fit with lights of these curvatures, by number of the light."""
         return run_fit("distances", sample, start.with_curvatures(curvatures), schedule)
 
-    # each fit continues from the previous one: far away, then nearer and nearer
-    fits = [before]
-    for c in (0.0, *CURVATURES):
-        fits.append(fit_with_curvatures(dict.fromkeys(candidates, c), fits[-1]))
-    values = np.array([fit.light_values for fit in fits[1:]])
+    values = np.array([fit_with_curvatures(dict.fromkeys(candidates, c)).light_values for c in (0.0, *CURVATURES)])
     log_bayes_factors = (values[0] - values[1:]) / 2
     likely = softmax(log_bayes_factors, axis=0).T @ CURVATURES
     factor = log_bayes_factors.max(0)

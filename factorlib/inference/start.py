@@ -108,8 +108,8 @@ class InitialFit(msgspec.Struct, frozen=True):
 def start_from_surface(initial: InitialFit) -> Start:
     """Return the start from a fit.
 
-    A light with other cells or other photos than the fit's is constant, and the start then counts as a first guess, from
-    which to descend as from mean radiances.
+    A light with other cells or other photos than the fit's is constant.  The start then counts as a first guess, from
+    which the solve descends as from mean radiances.
     """
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:

@@ -11,12 +11,12 @@ the radiance of their surroundings, and one lobe is added.  The lobe is as narro
     Σ_i t_i² (r_i + A_i(z) w)²                                                                                       (1)
 
 channel by channel, with t² the weight of the robust loss (0 where clipped and bright enough), A the whitened response.
-The residual is linear in w; z is searched over grids, coarse and then fine.  Then cells are fitted anew around either
-lobe.  The sun is kept if its light explains the observations better than cells alone, holds a share of the light, and
-is no bluer than all of it (`accept_sun`): air scatters blue light from the sun into the sky.  Natural light has suns,
-so the comparison with the wide lobe rejects one only if the evidence is clearly against it (`CLEARLY_AGAINST`).  All
-observations decide, not the held-out ones alone: a sun has five unknowns and replaces those of dozens of cells, so it
-hardly overfits.
+The residual is linear in w; z is searched over grids, coarse and then fine.  Then cells are fitted anew, around either
+lobe and alone.  The sun is kept if its light explains the observations better than cells alone, holds a share of the
+light, and is no bluer than all of it (`accept_sun`): air scatters blue light from the sun into the sky.  Natural light
+has suns, so the comparison with the wide lobe rejects one only if the evidence is clearly against it
+(`CLEARLY_AGAINST`).  All observations decide, not the held-out ones alone: a sun has five unknowns and replaces those
+of dozens of cells, so it hardly overfits.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from jaxtyping import Float
 
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference.blocks import COMPARISON_LOSS, FIT_LOSS
-from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
+from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule, Hyperparameters
 from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light, UnitLobes
@@ -68,25 +68,33 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
     changed = [k for k, cells in enumerate(without_suns) if candidates[k] is not cells.light]
     if not changed:
         return Selection(fit, evidence)
-    # cells are fitted anew around each sun
-    trial = run.fit_and_report("suns", problem, fit.with_lights(candidates), AROUND_SUNS)
-    with_suns = problem.illuminations(trial.point)
-    for k in changed:
-        evidence[k] = accept_sun(without_suns[k], with_suns[k])
-    accepted = [k for k in changed if evidence[k].accepted]
+
+    def fit_anew(numbers: list[int], lights: list[Light]) -> tuple[list[Illumination], list[Hyperparameters]]:
+        """Fit some lights, by their numbers; return their illuminations and hyperparameters."""
+        chosen = problem.select_lights(numbers)
+        start = Fit(Point(fit.point.materials, lights), [fit.hyperparameters[k] for k in numbers])
+        result = run.fit_and_report("suns", chosen, start, AROUND_SUNS)
+        return chosen.illuminations(result.point), result.hyperparameters
+
+    # cells are fitted anew around each sun, and as much without it
+    alone, _ = fit_anew(changed, [fit.point.lights[k] for k in changed])
+    with_suns, weights = fit_anew(changed, [candidates[k] for k in changed])
+    for k, cells, sun in zip(changed, alone, with_suns, strict=True):
+        evidence[k] = accept_sun(cells, sun)
+    accepted = {k: n for n, k in enumerate(changed) if evidence[k].accepted}
     if accepted:
         # a wide lobe in place of each accepted sun
         replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
-        wide = list(problem.spread(replace_widely, [without_suns[k] for k in accepted]))
-        start = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in accepted])
-        problem = problem.select_lights(accepted)
-        wide_fit = run.fit_and_report("suns", problem, start, AROUND_SUNS)
-        for k, with_wide_lobe in zip(accepted, problem.illuminations(wide_fit.point), strict=True):
-            decision = compare_illuminations(with_wide_lobe, with_suns[k], CLEARLY_AGAINST)
+        wide, _ = fit_anew(list(accepted), list(problem.spread(replace_widely, [without_suns[k] for k in accepted])))
+        for (k, n), with_wide_lobe in zip(accepted.items(), wide, strict=True):
+            decision = compare_illuminations(with_wide_lobe, with_suns[n], CLEARLY_AGAINST)
             evidence[k] = evidence[k] if decision.accepted else decision
-    fits = [trial if decision.accepted else fit for decision in evidence]
-    lights = [light_fit.point.lights[k] for k, light_fit in enumerate(fits)]
-    hyperparameters = [light_fit.hyperparameters[k] for k, light_fit in enumerate(fits)]
+    lights = list(fit.point.lights)
+    hyperparameters = list(fit.hyperparameters)
+    for k, n in accepted.items():
+        if evidence[k].accepted:
+            lights[k] = with_suns[n].light
+            hyperparameters[k] = weights[n]
     return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 

@@ -8,8 +8,10 @@ import pytest
 
 from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.images.tone import curve
+from factorlib.inference import suns
 from factorlib.inference.blocks import Noise
-from factorlib.inference.fit import reliable_observations
+from factorlib.inference.fit import FitSchedule, reliable_observations
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import BRIGHTEST
 from factorlib.inference.identifiability import unlikely_curves
@@ -24,17 +26,21 @@ from factorlib.inference.model_selection import (
     Losses,
     compare_models,
     near_share,
+    select_distances,
+    select_effects,
+    select_tone_curves,
 )
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
+from factorlib.inference.suns import select_suns
 from factorlib.inference.uncertainty import Posterior, estimate_uncertainty
 from factorlib.light.prior import read_light_prior
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, sphere_normals
 from factorlib.urm.observations import Observations
 from tests.inference.made import bowls, none_held_out, rough_light
-from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
+from tests.inference.made_lights import OPERATOR, begun, drawn, on_even_cells, spheres
 
 QUICK = SolveOptions(cells=60, splittings=0, observations=300)
 OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
@@ -226,6 +232,43 @@ def test_without_held_out_observations_shadows_stay_and_tone_curves_are_not_trie
 def test_without_interreflection_the_gauge_is_fixed_though_surfaces_light_each_other(lit):
     result = solved(lit, QUICK, cells=24, observations=100, interreflection="off")
     assert (result.point.materials.diffuse + result.point.materials.specular).max() == pytest.approx(BRIGHTEST)
+
+
+@pytest.fixture(scope="module")
+def begun_rooms():
+    problem = JointProblem(rooms(), OPERATOR)
+    return problem, FitRunner().fit("trial", problem, begun(problem, 60), FitSchedule(descents=(1,)))
+
+
+def test_models_that_predict_the_same_are_equal_evidence(begun_rooms, monkeypatch):
+    """Neither gets more descent than the other: shadows of nothing, lights at any distance of one point, tone curves that are left out, and
+    suns that are none."""
+    problem, fit = begun_rooms
+    open_ = {
+        "visibility": lambda b: np.full((len(b), 96), 255, np.uint8),
+        "directions": lambda b: fibonacci_sphere(96)[None],
+    }
+    shaded, central = (
+        problem.with_blocks(
+            [msgspec.structs.replace(b, **{name: of(b) for name, of in columns.items()}) for b in problem.blocks]
+        )
+        for columns in (open_, {"place": lambda b: np.zeros((len(b), 3))})
+    )
+    assert select_effects(shaded, [fit], QUICK, FitRunner().fit).shadows.margin == pytest.approx(0, abs=1e-6)
+    guess = msgspec.structs.replace(fit, fitted=False)
+    assert select_effects(shaded, [guess], QUICK, FitRunner().fit).shadows.margin == pytest.approx(0, abs=1e-6)
+    for decision in select_distances(central, fit, QUICK, FitRunner().fit).evidence:
+        assert decision.log_bayes_factor == pytest.approx(0, abs=1e-6)
+
+    def without_curves(phase, model, start, schedule):
+        straight = [msgspec.structs.replace(light, log_tone=np.zeros(0)) for light in start.point.lights]
+        return FitRunner().fit(phase, model, start.with_lights(straight), schedule)
+
+    for decision in select_tone_curves(problem, fit, QUICK, without_curves).evidence:
+        assert decision.margin == pytest.approx(0, abs=1e-6)
+    monkeypatch.setattr(suns, "replace_brightest", lambda one, sharpness: msgspec.structs.replace(one.light))
+    for decision in select_suns(problem, fit, FitRunner()).evidence:
+        assert decision.margin == pytest.approx(0, abs=1e-6)
 
 
 def test_one_cluster_is_no_evidence():
