@@ -124,10 +124,12 @@ class Solution(SolveState, frozen=True, kw_only=True):
     Attributes:
         point: Materials and lights, in the gauge of `factorlib.inference.gauge`.
         history: All evaluations.
+        prior: Prior on lights of the fits, and of their standard errors.
     """
 
     point: Point
     history: list[Event]
+    prior: LightPrior
 
 
 def subset_progress(progress: Progress, subsets: int) -> EventReport:

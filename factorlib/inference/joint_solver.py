@@ -91,7 +91,7 @@ def solve(
     answer = fix_gauge(state.fit.point, state.effective_problem(problem).blocks, problem.known)
     point = Point(problem.known.insert_into(answer.materials), answer.lights)
     steps = {name: getattr(state, name) for name in SolveState.__struct_fields__}
-    return Solution(**steps, point=point, history=run.history)
+    return Solution(**steps, point=point, history=run.history, prior=run.prior)
 
 
 def initial_fits(problem: JointProblem, start: Start, options: SolveOptions) -> list[Fit]:

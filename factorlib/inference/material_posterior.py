@@ -2,14 +2,15 @@
 
 A fit weighs observations as if the model were exact but for independent noise, so that a wrong mesh can outweigh any
 prior: stone becomes enamel.  Once the errors of the model are known (`factorlib.inference.uncertainty`), each material
-is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, S its covariance by the observations alone, and
-M that of errors of normals and of the model.  p is the mixture of classes of `factorlib.inference.material_prior`.  θ
-minimises
+is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, and A⁻¹ its covariance as the fit weighs its
+observations.  S is the covariance by the observations with correlated errors, at least A⁻¹, and M that of errors of
+normals and of the model.  p is the mixture of classes of `factorlib.inference.material_prior`.  θ minimises
 
-    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + S g                                     (1)
+    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + A⁻¹ g                                   (1)
 
-with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior, and θ₀ is the estimate of the observations
-without it.  So without errors of the model (M = 0) θ̂ stays.  S couples k_d to k_s, so k_d follows.  The covariance
+with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior against A, where A (θ̂ − θ₀) + g = 0, and θ₀ is
+the estimate of the observations without it.  So where errors are as the fit assumes (S = A⁻¹, M = 0) θ̂ stays.  S
+couples k_d to k_s, so k_d follows.  The covariance
 is ((S + M)⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one
 less the ratio of its variance to that in S + M.  The mixture is without ε, which is a term of the fit.  Here it would
 move sums of k_d and k_s that the observations determine.
@@ -27,9 +28,9 @@ from factorlib.inference.material_prior import Mixture, classes_of
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 
 BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
-# Largest standard deviation of an unknown in S: that of the logarithm of a reflectance near 0 is without limit.
+# Largest standard deviation of an unknown in S and A⁻¹: that of the logarithm of a reflectance near 0 is without limit.
 LARGEST_DEVIATION = 2.0
-LEAST_DEVIATION = 1e-6  # least standard deviation in S, so that it has an inverse
+LEAST_DEVIATION = 1e-6  # least standard deviation in them, so that S has an inverse
 
 
 class MaterialPosterior(NamedTuple):
@@ -48,6 +49,7 @@ class MaterialPosterior(NamedTuple):
 
 def material_posterior(
     fitted: Float[np.ndarray, "7"],
+    fit_covariance: Float[np.ndarray, "7 7"],
     covariance: Float[np.ndarray, "7 7"],
     model_covariance: Float[np.ndarray, "7 7"],
     free: Bool[np.ndarray, "7"],
@@ -57,6 +59,7 @@ def material_posterior(
 
     Args:
         fitted: θ̂.
+        fit_covariance: A⁻¹.
         covariance: S.
         model_covariance: M.
         free: Mask of the unknowns to be estimated.
@@ -66,8 +69,9 @@ def material_posterior(
     if not free[3:].any():
         return MaterialPosterior(fitted, deviation, np.zeros(7))
     mixture = Mixture(classes_of(name), one_tint=False)
-    limited, center = without_prior(fitted, covariance, free, mixture)
-    limited += model_covariance
+    # θ₀ of (1), and S + M
+    center = fitted + np.where(free, limit_deviations(fit_covariance) @ (free * mixture.evaluate(fitted)[1]), 0.0)
+    limited = limit_deviations(covariance) + model_covariance
     precision = np.linalg.inv(limited[np.ix_(free, free)])
     bounds = [(low, max(high, fitted[k])) for k, (low, high) in enumerate(BOUNDS) if free[k]]
 
@@ -94,11 +98,7 @@ def material_posterior(
     return MaterialPosterior(result, posterior_deviation, share)
 
 
-def without_prior(
-    fitted: Float[np.ndarray, "7"], covariance: Float[np.ndarray, "7 7"], free: Bool[np.ndarray, "7"], mixture: Mixture
-) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "7"]]:
-    """Return S with limited deviations, and θ₀ of (1)."""
+def limit_deviations(covariance: Float[np.ndarray, "7 7"]) -> Float[np.ndarray, "7 7"]:
+    """Return a covariance with deviations between `LEAST_DEVIATION` and `LARGEST_DEVIATION`."""
     scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(np.sqrt(np.diag(covariance)), LEAST_DEVIATION))
-    limited = covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)
-    slope = np.where(free, mixture.evaluate(fitted)[1], 0.0)
-    return limited, fitted + np.where(free, limited @ slope, 0.0)
+    return covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)

@@ -50,6 +50,7 @@ from factorlib.inference.optimizer import inverse_hessian_times
 from factorlib.inference.options import Lobes, Seed, SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import starting_materials
+from factorlib.light.prior import read_light_prior
 from factorlib.reflection.operator import Operator
 
 Objective = Callable[[Tensor], tuple[float, Tensor]]  # value and gradient at a point
@@ -116,7 +117,8 @@ def solve_paper(
             report(history[-1])
     fit = initial_fit(objective.point(x))
     point = fix_gauge(fit.point, blocks)
-    return Solution(fit, fit, observations=SolveOptions().observations, point=point, history=history)
+    observations = SolveOptions().observations
+    return Solution(fit, fit, observations=observations, point=point, history=history, prior=read_light_prior())
 
 
 def draw_subset(

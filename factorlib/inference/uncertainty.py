@@ -71,7 +71,7 @@ from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, Material
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
-from factorlib.light.prior import LightPrior, read_light_prior
+from factorlib.light.prior import LightPrior
 from factorlib.robust import robust_deviation
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
@@ -107,28 +107,29 @@ def estimate_uncertainty(
         tick: Called after each system of a light, one or (for the paper's solver) two a light.
     """
     problem = solution.effective_problem(problem)
-    prior = read_light_prior()
     errors = solution.errors
     if not len(errors.materials):  # of the paper's solver, which has no prior
         sample = reliable_observations(problem).subsample(solution.observations, options.seed)
-        errors = Posterior(sample, solution.materials, prior, tick).standard_errors()
+        errors = Posterior(sample, solution.materials, solution.prior, tick).standard_errors()
     # errors in proportion to reflectances, whose scale is that of the answer
     fitted = np.maximum(solution.fit.point.materials.rows(), LEAST_REFLECTANCE)
     in_gauge = errors.materials.rows() * (solution.point.materials.rows() / fitted)
     errors = msgspec.structs.replace(errors, materials=Materials.from_rows(in_gauge))
     light_sample = problem.subsample(solution.light_observations, options.seed)
-    return errors, Posterior(light_sample, solution.fit, prior, tick).relative_standard_errors()
+    return errors, Posterior(light_sample, solution.fit, solution.prior, tick).relative_standard_errors()
 
 
 class MaterialCovariance(NamedTuple):
     """Covariance of reflectances and roughnesses, in the gauge.
 
     Attributes:
-        by_data: Covariance by the observations: (1), or that of independent noise.
+        by_fit: Covariance by the observations as the fit weighs them, with independent noise.
+        by_data: Covariance by the observations: the widest of `by_fit` and (1).
         by_normals: Covariance by errors of normals, (2).
         deviation: Deviation of the whitened residuals.
     """
 
+    by_fit: Float[np.ndarray, "k k"]
     by_data: Float[np.ndarray, "k k"]
     by_normals: Float[np.ndarray, "k k"]
     deviation: float
@@ -175,15 +176,16 @@ class Posterior:
         precision, scores = information(self.systems(with_scores=True), len(values))
         clusters = [light_scores[0] / values for light_scores in scores]
         inverse = regularised_inverse(precision / np.outer(values, values), materials, self.problem)
+        by_fit = project_to_gauge(inverse, materials, self.problem)
         covariance = widest_covariance(inverse, clusters, materials, self.problem)
         turns = [turn / values for light_scores in scores for turn in light_scores[1:]]
         by_turns = np.vstack([np.zeros((0, len(values))), *turns]) @ inverse
         normals = project_to_gauge(by_turns.T @ by_turns, materials, self.problem)
-        return MaterialCovariance(covariance, normals, residual_deviation(self.problem, self.fit.point))
+        return MaterialCovariance(by_fit, covariance, normals, residual_deviation(self.problem, self.fit.point))
 
     def standard_errors(self) -> MaterialErrors:
         """Return the standard error of every material unknown by the observations alone."""
-        by_data, by_normals, deviation = self.covariance()
+        _, by_data, by_normals, deviation = self.covariance()
         free = self.problem.known.free(len(self.materials)).reshape(-1, 7)
         model_errors = free * deviation * MODEL_ERROR * by_unknowns(self.materials)
         # an error is at most the width of its unknown's range
@@ -192,7 +194,7 @@ class Posterior:
 
     def with_prior(self) -> tuple[Materials, MaterialErrors]:
         """Return the materials by `factorlib.inference.material_posterior`, and their standard errors."""
-        by_data, by_normals, deviation = self.covariance()
+        *covariances, deviation = self.covariance()
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
@@ -203,10 +205,10 @@ class Posterior:
         posteriors = []
         for m, theta in enumerate(unknowns):
             rows = slice(7 * m, 7 * m + 7)
-            data, normals = (each[rows, rows] / np.outer(values[m], values[m]) for each in (by_data, by_normals))
+            fitted, data, normals = (each[rows, rows] / np.outer(values[m], values[m]) for each in covariances)
             name = self.problem.known.classes.get(m)
             model = normals + np.diag((excess * MODEL_ERROR) ** 2)
-            posteriors.append(material_posterior(theta, data, model, free[m], name))
+            posteriors.append(material_posterior(theta, fitted, data, model, free[m], name))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
         deviations = np.hypot([posterior.deviation for posterior in posteriors], free * noise * MODEL_ERROR)
         errors = np.minimum(deviations * by_unknowns(materials), WIDTHS)

@@ -29,8 +29,13 @@ def random_covariance(seed: int) -> np.ndarray:
     return root @ root.T + np.diag([0.01] * 7)
 
 
+def posterior_of(fitted, sigma, *others):
+    """Where errors of the observations are as the fit assumes."""
+    return material_posterior(fitted, sigma, sigma, *others)
+
+
 def test_exact_observations_decide():
-    posterior = material_posterior(ENAMEL, covariance(1e-3), NO_ERROR, ALL)
+    posterior = posterior_of(ENAMEL, covariance(1e-3), NO_ERROR, ALL)
     np.testing.assert_allclose(posterior.theta, ENAMEL, atol=1e-4)
     assert (posterior.prior_share < 1e-3).all()
     np.testing.assert_allclose(posterior.deviation, 1e-3, rtol=1e-3)
@@ -44,12 +49,29 @@ def test_without_errors_of_the_model_a_fit_under_the_prior_stays(seed):
     fit = minimize(
         lambda x: (x - ENAMEL) @ precision @ (x - ENAMEL) + CLASSES.evaluate(x)[0], ENAMEL, bounds=BOUNDS, tol=1e-12
     )
-    posterior = material_posterior(fit.x, sigma, NO_ERROR, ALL)
+    posterior = posterior_of(fit.x, sigma, NO_ERROR, ALL)
     np.testing.assert_allclose(posterior.theta, fit.x, atol=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_correlated_errors_give_the_prior_more_weight_about_the_estimate_without_it(seed):
+    """The fit weighed its prior against its own covariance, and not against the wider one."""
+    sigma = random_covariance(seed)
+    starts = [ENAMEL, *(np.append(ENAMEL[:3], mean) for mean in CLASSES.mean)]
+
+    def least(precision: np.ndarray, start: np.ndarray):
+        return minimize(
+            lambda x: (x - ENAMEL) @ precision @ (x - ENAMEL) + CLASSES.evaluate(x)[0], start, bounds=BOUNDS, tol=1e-12
+        )
+
+    fit = least(np.linalg.inv(sigma), ENAMEL)
+    expected = min((least(np.linalg.inv(2 * sigma), start) for start in (fit.x, *starts)), key=lambda one: one.fun)
+    posterior = material_posterior(fit.x, sigma, 2 * sigma, NO_ERROR, ALL)
+    np.testing.assert_allclose(posterior.theta, expected.x, atol=2e-3)
+
+
 def test_where_the_model_is_wrong_the_material_is_a_likely_one():
-    posterior = material_posterior(ENAMEL, covariance([0.1] * 3 + [0.01] * 4), WRONG, ALL)
+    posterior = posterior_of(ENAMEL, covariance([0.1] * 3 + [0.01] * 4), WRONG, ALL)
     starts = [np.append(ENAMEL[:3], mean) for mean in CLASSES.mean]
     modes = [minimize(lambda x: CLASSES.evaluate(x)[0], start, tol=1e-10).fun for start in starts]
     assert CLASSES.evaluate(posterior.theta)[0] == pytest.approx(min(modes), abs=1.0)
@@ -62,7 +84,7 @@ def test_no_point_of_a_search_has_less_energy(seed):
     """Where errors of the model exceed those of the observations."""
     random = np.random.default_rng(seed)
     sigma, errors = random_covariance(seed), covariance([0.1] * 3 + [1.0] * 3 + [0.3])
-    posterior = material_posterior(ENAMEL, sigma, errors, ALL)
+    posterior = posterior_of(ENAMEL, sigma, errors, ALL)
     center = ENAMEL + sigma @ CLASSES.evaluate(ENAMEL)[1]
     precision = np.linalg.inv(sigma + errors)
 
@@ -80,7 +102,7 @@ def test_the_diffuse_part_takes_what_the_specular_part_loses():
     """Errors of the model give the prior its say, and k_d follows by the observations' correlation."""
     sigma = covariance([0.3] * 3 + [0.5] * 3 + [0.1], correlation=-0.9)
     center = ENAMEL + sigma @ CLASSES.evaluate(ENAMEL)[1]
-    off = material_posterior(ENAMEL, sigma, covariance([0.0] * 3 + [1.0] * 3 + [0.5]), ALL).theta - center
+    off = posterior_of(ENAMEL, sigma, covariance([0.0] * 3 + [1.0] * 3 + [0.5]), ALL).theta - center
     share = sigma[0, 3] / (sigma[3, 3] + 1.0)
     assert (off[3:6] < -0.2).all()
     np.testing.assert_allclose(off[:3], share * off[3:6], rtol=1e-3)
@@ -89,27 +111,27 @@ def test_the_diffuse_part_takes_what_the_specular_part_loses():
 def test_known_unknowns_stay():
     free = np.array([True] * 3 + [False] * 4)
     errors = covariance(0.3)
-    posterior = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.2), 0.0), errors, free)
+    posterior = posterior_of(ENAMEL, np.where(np.outer(free, free), covariance(0.2), 0.0), errors, free)
     np.testing.assert_array_equal(posterior.theta, ENAMEL)
     assert (posterior.deviation[3:] == 0).all() and (posterior.prior_share == 0).all()
     free[3:] = [True] * 3 + [False]
-    partly = material_posterior(ENAMEL, np.where(np.outer(free, free), covariance(0.5), 0.0), errors, free)
+    partly = posterior_of(ENAMEL, np.where(np.outer(free, free), covariance(0.5), 0.0), errors, free)
     assert partly.theta[6] == ENAMEL[6] and partly.deviation[6] == 0 and (partly.theta[3:6] != ENAMEL[3:6]).any()
 
 
 def test_a_reflectance_near_zero_does_not_look_exactly_known():
     """Its logarithm has no limit, and its error is that of the observations."""
     black = np.array([*np.log([1e-5] * 3), *ENAMEL[3:]])
-    posterior = material_posterior(black, covariance([2000.0] * 3 + [0.1] * 3 + [0.05]), NO_ERROR, ALL)
+    posterior = posterior_of(black, covariance([2000.0] * 3 + [0.1] * 3 + [0.05]), NO_ERROR, ALL)
     np.testing.assert_allclose(posterior.deviation[:3] * 1e-5, 0.02, rtol=0.05)
 
 
 def test_observations_without_any_error_decide():
-    posterior = material_posterior(ENAMEL, np.zeros((7, 7)), NO_ERROR, ALL)
+    posterior = posterior_of(ENAMEL, np.zeros((7, 7)), NO_ERROR, ALL)
     np.testing.assert_allclose(posterior.theta, ENAMEL, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "least", "most"), [("dielectric", 0.01, 0.06), ("metal", 0.06, 0.3)])
 def test_a_named_class_decides_where_the_model_is_wrong(name, least, most):
-    posterior = material_posterior(ENAMEL, covariance(0.01), WRONG, ALL, name)
+    posterior = posterior_of(ENAMEL, covariance(0.01), WRONG, ALL, name)
     assert least < np.exp(posterior.theta[3:6].mean()) < most

@@ -36,11 +36,10 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
 from factorlib.inference.suns import select_suns
 from factorlib.inference.uncertainty import Posterior, estimate_uncertainty
-from factorlib.light.prior import read_light_prior
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, sphere_normals
 from factorlib.urm.observations import Observations
 from tests.inference.made import bowls, none_held_out, rough_light
-from tests.inference.made_lights import OPERATOR, begun, drawn, on_even_cells, spheres
+from tests.inference.made_lights import OPERATOR, PRIOR, begun, drawn, on_even_cells, spheres
 
 QUICK = SolveOptions(cells=60, splittings=0, observations=300)
 OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
@@ -324,12 +323,17 @@ def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
 def test_standard_errors_are_relative_to_the_reflectances_of_the_answer():
     """The answer is in another gauge than the fit of the materials, and a factor per channel changes no relative error."""
     problem = JointProblem(rooms(), OPERATOR)
-    solution = solve(problem, start_from_photos(len(MATERIALS)), QUICK)
+    # a prior of more contrast than the shipped one, which is that of the errors as well
+    prior = msgspec.structs.replace(PRIOR, variance=tuple(4 * v for v in PRIOR.variance))
+    solution = solve(problem, start_from_photos(len(MATERIALS)), QUICK, FitRunner(prior=prior))
     answer, fitted = solution.point.materials, solution.fit.point.materials
     assert np.abs(np.log(answer.specular / fitted.specular)).max() > 0.02  # the gauges differ
-    errors, _ = estimate_uncertainty(solution, problem, QUICK)
+    errors, maps = estimate_uncertainty(solution, problem, QUICK)
     sample = reliable_observations(problem).subsample(QUICK.observations, QUICK.seed)
-    own = Posterior(sample, solution.materials, read_light_prior()).with_prior()[1].materials
+    own = Posterior(sample, solution.materials, prior).with_prior()[1].materials
     for name in ("diffuse", "specular"):
         relative = getattr(errors.materials, name) / getattr(answer, name)
         np.testing.assert_allclose(relative, getattr(own, name) / getattr(fitted, name), rtol=1e-9)
+    of_lights = Posterior(problem.subsample(solution.light_observations, QUICK.seed), solution.fit, prior)
+    for name, errors_of_light in of_lights.relative_standard_errors().items():
+        np.testing.assert_allclose(maps[name], errors_of_light)
