@@ -28,12 +28,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, kron
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse import block_diag, csr_array, eye_array, hstack, kron
+from scipy.sparse.linalg import LinearOperator
 
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, face_normals
 from factorlib.inference.blocks import FIT_LOSS, Block
+from factorlib.inference.conjugate_gradients import solve_by_gradients
 from factorlib.inference.fit import Hyperparameters, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.light.prior import LightPrior
@@ -45,7 +46,6 @@ LARGEST_TURN = 0.6  # largest |n' − n|: 35°
 LEAST_VIEW_COSINE = 0.05  # least n'·o: a normal that would turn further stays as it is
 PULL_SHARE = 0.06  # b/a, which fixes nodes without observations nearby
 CG_TOLERANCE = 3e-3  # relative tolerance of conjugate gradients
-CG_ITERATIONS = 150  # most iterations of conjugate gradients
 
 
 class SurfacePositions(msgspec.Struct, frozen=True):
@@ -381,9 +381,5 @@ def solve_detail(
         return prior @ x + sum(J.T @ part.reduce_by_light(J @ x) for part, J in zip(parts, slopes, strict=True))
 
     size = 2 * (len(target),)
-    preconditioner = diags_array(1 / diagonal)
-    step, _ = cg(
-        LinearOperator(size, system, dtype=float), target, rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
-    )
-    unknowns[free] += step
+    unknowns[free] += solve_by_gradients(LinearOperator(size, system, dtype=float), target, diagonal, CG_TOLERANCE)
     return Detail(*unknowns.reshape(2, v, 3))

@@ -29,9 +29,9 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array, eye_array
-from scipy.sparse.linalg import cg
 
 from factorlib.inference.blocks import RobustLoss
+from factorlib.inference.conjugate_gradients import solve_by_gradients
 from factorlib.inference.model_selection import CLEARLY_FOR, Losses, compare_models
 from factorlib.results.materials import Decision
 
@@ -47,7 +47,6 @@ INVISIBLE = 0.002
 LARGEST_RATIO = 20.0  # largest z
 LEAST_SHARED = 0.2  # least weight of other photos' pixels about a node that counts as seen by them
 CG_TOLERANCE = 1e-3
-CG_ITERATIONS = 300
 FOLDS = 4  # folds of photos
 
 
@@ -123,11 +122,9 @@ def solve_texture(
             weighted = csr_array(sample.operator.T @ diags_array(weight))
             system = csr_array(system + weighted @ sample.operator)
             target += weighted @ sample.ratio
-        preconditioner = diags_array(1 / system.diagonal())
+        diagonal = system.diagonal()
         for c in range(3):
-            factor[:, c] = cg(
-                system, target[:, c], x0=factor[:, c], rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
-            )[0]
+            factor[:, c] = solve_by_gradients(system, target[:, c], diagonal, CG_TOLERANCE, factor[:, c])
         weights = [s.weight * LOSS.weights(s.ratio - s.operator @ factor).mean(1) for s in samples]
     return factor
 
