@@ -4,13 +4,16 @@
 
     b = log Σ_j w_j L_j / Σ_j w_j,     w_j = exp(λ(z · ω_j − 1)) Ω_j,     coverage c = Σ_j w_j / ∫ exp(λ(z · ω − 1)) dω,
 
-with the cell's own lobe as the kernel, over the observed texels j of direction ω_j and solid angle Ω_j.  Its error has
-the standard deviation `DEVIATION`/√c: surroundings are neither diffuse nor where the ground plane says, and objects
-shade the ground below them.  For u ~ N(0, Q⁻¹) that gives u ~ N(m, P⁻¹) with
+with the cell's own lobe as the kernel, over the observed texels j of direction ω_j and solid angle Ω_j.  Surroundings
+are neither diffuse nor where the ground plane says, and objects shade the ground below them.  Each cell therefore has
+an error of its own, of standard deviation `DEVIATION`/√c, and all cells together are too bright or too dark by a factor
+per channel, whose logarithms have the covariance T of `SCALE_DEVIATION` and `TINT_DEVIATION`.  With A the columns that
+select the cells of a channel, the error of b has the covariance D⁻¹ + A T Aᵀ and, by Woodbury, the precision R.  For
+u ~ N(0, Q⁻¹) that gives u ~ N(m, P⁻¹) with
 
-    P = Q + D,     P m = D b,     D = diag(c)/DEVIATION².                                                            (1)
+    P = Q + R,     P m = R b,     R = D − D A (T⁻¹ + AᵀD A)⁻¹ AᵀD,     D = diag(c)/DEVIATION².                       (1)
 
-Radiance of surroundings is absolute, so a background also fixes the scale between reflectances and lights.
+Radiance of surroundings is absolute, so a background also tells the scale between reflectances and lights, within T.
 """
 
 from __future__ import annotations
@@ -25,6 +28,13 @@ from factorlib.inference.lights import Light
 from factorlib.light.lobes import lobe_energy
 
 DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is observed whole
+# Standard deviations of the factor that all cells of a light share: of the mean over channels of its logarithm, and of
+# tints about it.  Two sets of six photos with backgrounds were relit by factors of 1.15, 1.11, 1.04 and 1.21, 1.16,
+# 1.06 (RGB), and a factor of a set is the mean of its photos'.  So the deviations are √6 times those of the two sets,
+# 0.115 for the mean and 0.06 for tints.
+SCALE_DEVIATION = 0.28
+TINT_DEVIATION = 0.15
+SHARED_COVARIANCE = np.full((3, 3), SCALE_DEVIATION**2) + TINT_DEVIATION**2 * (np.eye(3) - 1 / 3)  # T
 SHARPEST = 350.0  # largest λ of a kernel, about as wide as a texel
 # Least share of the sphere that the background of a photo covers.  A long lens shows only what is straight behind the
 # objects, such as black cloth or sky.  This says nothing of the light, but would fix the scale of reflectances.
@@ -91,8 +101,10 @@ def condition_on_background(
         light: Cells and suns of the light.
     """
     coverage, log_radiance = background.observe(light)
-    D = np.tile(coverage / DEVIATION**2, 3)
-    P = Q + np.diag(D)
+    D = coverage / DEVIATION**2
+    shared = np.linalg.inv(np.linalg.inv(SHARED_COVARIANCE) + D.sum() * np.eye(3))
+    R = np.diag(np.tile(D, 3)) - np.kron(shared, np.outer(D, D))
+    P = Q + R
     factor = cholesky(P, lower=True, check_finite=False)
-    mean = cho_solve((factor, True), D * log_radiance.T.reshape(-1), check_finite=False)
+    mean = cho_solve((factor, True), R @ log_radiance.T.reshape(-1), check_finite=False)
     return mean, P, 2 * float(np.log(np.diag(factor)).sum())

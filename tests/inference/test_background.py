@@ -6,9 +6,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.inference.background import DEVIATION, Background, concatenate_backgrounds, condition_on_background
+from factorlib.inference.background import (
+    DEVIATION,
+    SCALE_DEVIATION,
+    SHARED_COVARIANCE,
+    Background,
+    concatenate_backgrounds,
+    condition_on_background,
+)
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.gauge import has_free_factor
-from factorlib.inference.joint_solver import solve
+from factorlib.inference.held_out_photos import fit_held_out_lights
+from factorlib.inference.joint_solver import LIGHTS, solve
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.paper_solver import PaperOptions, solve_paper
 from factorlib.inference.start import start_from_photos
@@ -34,10 +43,13 @@ def test_the_prior_given_a_background_is_that_of_gaussian_regression():
     coverage, b = background.observe(light)
     s = np.flatnonzero(np.tile(coverage, 3) > 1e-9)
     K, D = np.linalg.inv(Q), np.tile(coverage, 3) / DEVIATION**2
-    gain = K[:, s] @ np.linalg.inv(K[np.ix_(s, s)] + np.diag(1 / D[s]))
+    errors = np.diag(1 / D[s]) + np.kron(SHARED_COVARIANCE, np.ones((80, 80)))[np.ix_(s, s)]
+    gain = K[:, s] @ np.linalg.inv(K[np.ix_(s, s)] + errors)
     np.testing.assert_allclose(mean, gain @ b.T.reshape(-1)[s], atol=1e-6)
     np.testing.assert_allclose(np.linalg.inv(P), K - gain @ K[s], atol=1e-6)
     assert log_determinant == pytest.approx(np.linalg.slogdet(P)[1])
+    # the scale of the whole light, which many cells observe, is known as well as one background's
+    assert np.linalg.inv(P).mean() > 0.9 * SCALE_DEVIATION**2
 
 
 def test_a_cell_sees_the_mean_of_its_own_part_of_the_surroundings():
@@ -105,6 +117,21 @@ def test_where_no_background_is_kept_the_answer_is_that_without_backgrounds(lit)
     with_one, without = (solve(each, start_from_photos(3), QUICK) for each in (doubtful, lit.without_backgrounds()))
     assert with_one.backgrounds[1].log_bayes_factor < 0 and not with_one.backgrounds[1].accepted
     np.testing.assert_array_equal(with_one.point.materials.rows(), without.point.materials.rows())
+
+
+def test_a_held_out_photo_gets_its_light_as_the_solve_does(lit, monkeypatch):
+    """By the same schedule, and without a background that the objects are against."""
+    solution = solve(lit.select_lights([0, 1]), start_from_photos(3), QUICK)
+    fit, schedules = FitRunner.fit, []
+    monkeypatch.setattr(FitRunner, "fit", lambda self, *how: schedules.append(how[-1]) or fit(self, *how))
+    alone = lit.select_lights([2])
+    dark = lit.with_blocks([darkened(lit.blocks[2])])
+    given, without, doubtful = (
+        fit_held_out_lights(each, solution, QUICK)[0]["room2"].weight
+        for each in (alone, alone.without_backgrounds(), dark)
+    )
+    np.testing.assert_allclose(doubtful, without, rtol=0.02)
+    assert np.abs(np.log(given / without)).max() > 0.1 and schedules[-1] is LIGHTS
 
 
 def test_the_factor_of_a_component_is_free_unless_a_background_fixes_it(lit):
