@@ -52,7 +52,7 @@ from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Name
 from factorlib.results.lobe_table import write_lobes
-from factorlib.results.materials import Channels
+from factorlib.results.materials import Channels, vec3
 from factorlib.results.solution import EarlierSolution, read_earlier_solution
 from factorlib.results.surface_table import BEGINNING
 from factorlib.stage import Inputs, Progress
@@ -265,11 +265,19 @@ def _held_out_photos(
     if not (apart.radiance > 0).any():
         return {}, exposures
     worlds = {n: np.array(s.world_from_camera) for n, s in slices.items() if s.world_from_camera is not None}
-    blocks = blocks_of_observations(apart, Noise(), held_out=0.0, world_from_camera=worlds, seed=params.seed)
+    relative = urm.relative_exposures(apart)
+    blocks = blocks_of_observations(
+        urm.at_one_exposure(apart, relative),
+        Noise(),
+        held_out=0.0,
+        world_from_camera=worlds,
+        seed=params.seed,
+        backgrounds=read_backgrounds(inputs["urm"], relative),
+    )
     problem = JointProblem(blocks, answer.problem.operator, inputs.map)
     progress(1, 1, "lights of held-out photos")
-    lights, exposures_of_lights = fit_held_out_lights(problem, answer.solution, params)
-    return lights, exposures | exposures_of_lights
+    lights, factors = fit_held_out_lights(problem, answer.solution, params)
+    return lights, exposures | {photo: vec3(relative[photo] * np.array(factor)) for photo, factor in factors.items()}
 
 
 def _surface_start(inputs: Inputs, problem: JointProblem) -> Start | None:

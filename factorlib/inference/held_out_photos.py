@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import msgspec
 import numpy as np
 
-from factorlib.inference.fit import LIGHT_TEMPERATURE, FitSchedule, initial_fit
-from factorlib.inference.fit_runner import FitRunner, Solution
+from factorlib.inference.fit import FitSchedule, initial_fit
+from factorlib.inference.fit_runner import FitRunner, Solution, SolveState
+from factorlib.inference.joint_solver import STEPS, SolveRequest
+from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -21,13 +24,16 @@ from factorlib.light.lobes import Lobes
 from factorlib.results.materials import Channels, vec3
 from factorlib.urm.observations import Observations
 
-SCHEDULE = FitSchedule(light_steps=10, descents=(4, 4), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
+FROM_CONSTANT = FitSchedule(light_steps=10, materials_fixed=True)
 
 
 def fit_held_out_lights(
     problem: JointProblem, solution: Solution, options: SolveOptions
 ) -> tuple[dict[str, Lobes], dict[str, Channels]]:
     """Fit lights to the photos of a problem, with the materials of a solution, and return them with the exposures.
+
+    The steps are those of the joint solve, and the materials are known.  Backgrounds are used if the solution uses
+    some: otherwise the scale of its materials is arbitrary, and that of a background is not.
 
     Args:
         problem: Observations of held-out photos whose lights no solved photo shows.
@@ -37,14 +43,21 @@ def fit_held_out_lights(
     Returns:
         The lobes by illumination, in scene radiance, and each photo's factor on its light.
     """
-    problem = problem.with_effects(solution.shadows.accepted, solution.interreflection.accepted)
-    problem = problem.subsample(options.observations, options.seed)
     materials = solution.point.materials
+    problem = msgspec.structs.replace(problem, known=KnownValues(dict(enumerate(materials.rows()))))
+    if not any(decision.accepted for decision in solution.backgrounds):
+        problem = problem.without_backgrounds()
+    run = FitRunner(prior=solution.prior)
     start = Point(materials, [constant_light(block, materials, options.cells) for block in problem.blocks])
-    fit = FitRunner().fit("held-out photos", problem, initial_fit(start), SCHEDULE)
+    first = initial_fit(start)
+    state = SolveState(first, first, solution.shadows, solution.interreflection, observations=solution.observations)
+    request = SolveRequest(problem, [first], options, run)
+    fit = run.fit("lights", request.light_problem(state), first, FROM_CONSTANT)
+    steps = {name: STEPS[name] for name in ("background", "lights")}
+    point = run.run_steps(steps, request, state.with_fit(fit)).fit.point
     lobes: dict[str, Lobes] = {}
     exposures: dict[str, Channels] = {}
-    for block, light in zip(problem.blocks, fit.point.lights, strict=True):
+    for block, light in zip(problem.blocks, point.lights, strict=True):
         lobes[block.name] = light.lobes.scale(block.unit)
         factors = np.exp(light.log_exposure).tolist()
         exposures |= {photo: (factor,) * 3 for photo, factor in zip(block.photos, factors, strict=True)}

@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.inference.blocks import Noise
@@ -288,6 +289,31 @@ def test_a_held_out_photo_changes_no_answer_and_is_predicted(tmp_path, linked, s
     material = table(out)["materials"]["green"]
     reflectance = np.add(material["diffuse"], material["specular"]) / (MATERIALS.diffuse + MATERIALS.specular)[1]
     np.testing.assert_allclose(energy * reflectance / true, 1, atol=0.25)
+
+
+def test_the_background_of_a_held_out_photo_tells_its_light(tmp_path, linked):
+    """Where its surfaces, which face up, do not."""
+    photo = observations("d", [1], 7)
+    photo = photo.take(photo.normal[:, 1] < -0.3)
+    directions = lat_long_directions(32, 64)
+    below = directions[..., 1] < 0
+
+    def true(seed: int) -> np.ndarray:
+        return random_lobes(seed).radiance((directions @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(32, 64, 3)
+
+    light = {name: {"illumination": name, "world_from_camera": None, "held_out": name == "d"} for name in "abd"}
+    errors, tables = [], []
+    for seeds in ({"a": 1, "b": 2}, {"a": 1, "b": 2, "d": 7}):
+        folder = tmp_path / str(len(seeds)) / "urm/background"
+        folder.mkdir(parents=True)
+        for name, seed in seeds.items():
+            write_rgb_exr(folder / f"{name}.exr", true(seed) * below[..., None], LAT_LONG)
+        out = run(folder.parents[1], linked | {"d": photo}, light=light)
+        estimate = lat_long_of_lobes(read_lobes(out / "lobes.parquet")["d"], 32, 64)
+        errors.append(np.abs(np.log(estimate / true(7)))[below].mean())
+        tables.append(table(out))
+    assert tables[0] == tables[1] and tables[0]["model"]["background_chosen_by"]["b"]["kept"]
+    assert errors[1] < 0.8 * errors[0]
 
 
 def test_exposures_of_held_out_photos_follow_exif(tmp_path, linked):
