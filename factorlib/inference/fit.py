@@ -46,7 +46,7 @@ RELIABLE = 0.6  # least confidence of a normal, as a share of its material's med
 DARK_NOISE = 0.2  # factor on the noise model's absolute part where normals are reliable
 START_TEMPERATURE = 10.0
 # Factor on T where materials are given.  A light absorbs what wrong normals and materials do to a whole object, so that
-# residuals do not show it.  Without the factor lights have too much contrast, and their dark directions are too dark.
+# residuals do not show it.  With the factor log radiance of made lights is nearer to the truth; with more it is not.
 LIGHT_TEMPERATURE = 4.0
 # The same where the light's background is observed too.
 BACKGROUND_TEMPERATURE = 2.0

@@ -41,7 +41,7 @@ MAPS = 6  # of a set: one for each photo
 PRIOR = Path("factorlib/light/prior.json")
 COPIED = ("factorlib", "stages", "recipes", "pipeline.yaml")
 DEVIATIONS = ("k_d", "k_s", "roughness", "log radiance of lights")
-FIFTHS = ("darkest", "second", "third", "fourth", "brightest")  # of directions, by estimated radiance
+FIFTHS = ("darkest", "second", "third", "fourth", "brightest")  # of directions, by true radiance
 LIGHT = "light.mean.channel_per_photo"
 BALLS = "relighting.mean.channel_per_photo"
 PSNR = "psnr_tonemapped_db"
@@ -118,10 +118,14 @@ class SetResult(NamedTuple):
             yield cell_means(read_rgb_exr(self.build / "export/illumination" / path.name), cells) / factor, true
 
     def fifths(self) -> np.ndarray:
-        """Return estimated over true radiance of the `FIFTHS`, over all lights, each relative to its true mean."""
+        """Return estimated over true radiance of the `FIFTHS`, over all lights, each relative to its true mean.
+
+        Directions are sorted by the truth: sorted by the estimate, one whose light shrinks toward its mean would look
+        better for that.
+        """
         sums = np.zeros((2, len(FIFTHS)))
         for light, true in self.lights():
-            parts = np.array_split(light.sum(1).argsort(), len(FIFTHS))
+            parts = np.array_split(true.sum(1).argsort(), len(FIFTHS))
             sums += [[radiance[part].sum() / true.mean() for part in parts] for radiance in (light, true)]
         return sums[0] / sums[1]
 
