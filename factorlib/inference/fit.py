@@ -22,7 +22,6 @@ more to all observations: rims and thin parts show directions that nothing else 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -158,7 +157,8 @@ def fit_problem(
             # T of (1) and s_k² of each light, from the previous descent
             solved = list(zip(state.likelihoods, state.systems, strict=True))
             hyperparameters = list(problem.spread(lambda pair: estimate(*pair), solved))
-            state = state._replace(likelihoods=list(map(with_hyperparameters, state.likelihoods, hyperparameters)))
+            illuminations = [likelihood.illumination for likelihood in state.likelihoods]
+            state = state._replace(likelihoods=list(map(with_table, illuminations, hyperparameters)))
         if schedule.materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
@@ -185,37 +185,17 @@ def light_likelihood(
     """Return the likelihood of one light, with its table of responses and the given hyperparameters.
 
     Args:
-        illumination: Observations, light and materials.
+        illumination: Observations, light and materials; its table is used again.
         hyperparameters: Hyperparameters.
         prior: Prior on lights.
         materials_given: True if the materials do not change.
         tables: Cache of response tables; None for a new one.
     """
-    roughness = illumination.materials.roughness if materials_given else None
-    arguments = illumination.block, illumination.light.unit_lobes, illumination.operator
-    table = (tables or ResponseCache()).get(*arguments, roughness)
-    tabulated = msgspec.structs.replace(illumination, table=table)
-    shadows = illumination.block.ground
-    if shadows is not None and not illumination.light.fixed.any():
-        ground = cast_shadows(shadows, *arguments[1:])
-    else:
-        ground = None
-    log_peaks = np.log(illumination.light.peaks)
-    terms = hyperparameter_terms(illumination, prior, hyperparameters)
-    return LightLikelihood(tabulated, prior, log_peaks, loss=FIT_LOSS, ground=ground, **terms)
-
-
-def with_hyperparameters(likelihood: LightLikelihood, hyperparameters: Hyperparameters) -> LightLikelihood:
-    """Return the likelihood with other hyperparameters."""
-    terms = hyperparameter_terms(likelihood.illumination, likelihood.prior, hyperparameters)
-    return msgspec.structs.replace(likelihood, **terms)
-
-
-def hyperparameter_terms(
-    illumination: Illumination, prior: LightPrior, hyperparameters: Hyperparameters
-) -> dict[str, Any]:
-    """Return m, Q, log det Q and T, the fields of `LightLikelihood` that hyperparameters determine."""
     light = illumination.light
+    block = illumination.block
+    roughness = illumination.materials.roughness if materials_given else None
+    arguments = light.unit_lobes, illumination.operator
+    table = illumination.table or (tables or ResponseCache()).get(block, *arguments, roughness)
     # Q of the cells, under the scale factors s_k²
     Q, log_determinant = prior.precision(light.axis[~light.suns], hyperparameters.factors)
     if light.suns.any():  # the prior on cells does not cover suns: each has an independent Gaussian
@@ -228,11 +208,14 @@ def hyperparameter_terms(
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
     mean = np.zeros(len(Q))
-    background = illumination.block.background
-    if background is not None and not light.fixed.any():
-        mean, Q, log_determinant = condition_on_background(Q, background, light)
-    temperature = hyperparameters.temperature
-    return {"mean": mean, "precision": Q, "log_determinant": log_determinant, "temperature": temperature}
+    ground = None
+    if block.background is not None and not light.fixed.any():
+        mean, Q, log_determinant = condition_on_background(Q, block.background, light)
+    if block.ground is not None and not light.fixed.any():
+        ground = cast_shadows(block.ground, *arguments)
+    tabulated = msgspec.structs.replace(illumination, table=table)
+    weights = mean, Q, log_determinant, hyperparameters.temperature
+    return LightLikelihood(tabulated, prior, np.log(light.peaks), *weights, FIT_LOSS, ground)
 
 
 def estimate_hyperparameters(

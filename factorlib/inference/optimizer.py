@@ -190,12 +190,12 @@ class Descent(msgspec.Struct, frozen=True):
         """Return lights and materials at the minimum of (2)."""
         size = state.theta.size
         by_determinant, hessian = determinant_terms(state.systems, size)
-        # half the gradient of (1) by materials; unknowns at a bound that it would push outward are fixed
+        # half the gradient of (1) by materials; unknowns at a limit that it would push beyond it are fixed
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        free = self.free & ~outward_mask(state.theta.reshape(-1), -gradient)
-        limits = [material_limits(state.theta, free), *(light_limits(each.light) for each in state.likelihoods)]
+        limits = [material_limits(state.theta, self.free), *(light_limits(each.light) for each in state.likelihoods)]
+        free = np.where(gradient > 0, limits[0][0] < 0, limits[0][1] > 0)
         # H with D and the damping μ
         arrow = Arrow(state.systems, state.prior.hessian + hessian, free, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
@@ -228,13 +228,6 @@ class Descent(msgspec.Struct, frozen=True):
 
         theta, likelihoods = apply_step(minimise_lbfgs(objective, np.hstack(limits), metric))
         return likelihoods, theta
-
-
-def outward_mask(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
-    """Return a mask of the unknowns at a bound that a direction would push beyond it."""
-    lower = (theta <= np.resize(LOWER_BOUNDS, theta.size)) & (direction < 0)
-    upper = (theta >= np.resize(UPPER_BOUNDS, theta.size)) & (direction > 0)
-    return lower | upper
 
 
 def material_limits(theta: Float[np.ndarray, "m 7"], free: Bool[np.ndarray, " k"]) -> Float[np.ndarray, "2 k"]:

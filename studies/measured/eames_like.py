@@ -231,7 +231,7 @@ def rows_of(results: Sequence[SetResult]) -> list[list[str]]:
         table.append([quantity.meaning, *cells])
     for name, *ratios in zip(FIFTHS, *(result.fifths() for result in results), strict=True):
         cells = [f"{ratio:.2f}" for ratio in [*ratios, np.mean(ratios[1:])]]
-        table.append([f"{name} fifth of directions, estimated over true radiance", *cells])
+        table.append([f"{name} fifth of directions by true radiance, estimated over true", *cells])
     pairs = [result.chroma() for result in results]
     pairs.append(tuple(np.mean(pairs[1:], axis=0)))
     table.append(["chroma of lights, log", *(f"{error:.3f} ({null:.3f})" for error, null in pairs)])
