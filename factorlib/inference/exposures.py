@@ -26,8 +26,6 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.known import KnownValues
 from factorlib.inference.likelihood import EXPOSURE_DEVIATION, LightLikelihood
-from factorlib.inference.material_prior import materials_from_unknowns
-from factorlib.inference.materials import Materials
 from factorlib.inference.optimizer import Descent, DescentState
 
 
@@ -47,8 +45,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
     group = material_groups(blocks, len(theta), known)
     movable = np.zeros(len(theta), bool)
     for members, lights in connected_components(blocks, len(theta)):
-        rows = list(members)
-        movable[rows] = len(set(group[rows])) > 1 and known.free_factors(members, lights) == 3
+        movable[list(members)] = len(set(group[list(members)])) > 1 and known.free_factors(members, lights) == 3
     moving = np.unique(group[movable])
     if not len(moving):
         return state
@@ -75,8 +72,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
         return value, slope[moving]
 
     moved, log_factors = move(minimize(energy, np.zeros(len(moving)), jac=True).x)
-    materials = materials_from_unknowns(moved)
-    balanced = descent.linearise([term.moved(log_factors, materials) for term in terms], moved)
+    balanced = descent.linearise([term.moved(log_factors) for term in terms], moved)
     return balanced if balanced.value < state.value else state
 
 
@@ -111,12 +107,12 @@ class ExposureTerms:
         gradient[self.groups[0]] += slopes.sum() - 2 * (self.slope + shift * self.curvature)
         return value, gradient
 
-    def moved(self, log_factors: Float[np.ndarray, " m"], materials: Materials) -> LightLikelihood:
-        """Return the likelihood after a move."""
+    def moved(self, log_factors: Float[np.ndarray, " m"]) -> LightLikelihood:
+        """Return the likelihood after a move, at the materials before it."""
         light = self.likelihood.light
         weight = light.weight / np.exp(log_factors[self.groups[0]])
         light = msgspec.structs.replace(light, weight=weight, log_exposure=self._exposures(log_factors))
-        return self.likelihood.with_point(light, materials)
+        return self.likelihood.with_point(light)
 
     def _exposures(self, log_factors: Float[np.ndarray, " m"]) -> Float[np.ndarray, " f"]:
         """Return the log exposures after a move."""

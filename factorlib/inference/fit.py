@@ -88,14 +88,6 @@ class Fit(msgspec.Struct, frozen=True):
         """Return the start of another fit, in other lights."""
         return msgspec.structs.replace(self, point=Point(self.point.materials, lights))
 
-    def with_curvatures(self, curvatures: dict[int, float]) -> Fit:
-        """Return the start of another fit, with other curvatures of some lights, by number of the light."""
-        lights = [
-            msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature))
-            for k, light in enumerate(self.point.lights)
-        ]
-        return self.with_lights(lights)
-
 
 class FitSchedule(msgspec.Struct, frozen=True):
     """Schedule of a fit: its descents, their steps, and when hyperparameters are estimated.
@@ -167,12 +159,11 @@ def fit_problem(
             state = balance_exposures(state, descent, problem.known)
     if not schedule.materials_fixed:
         materials = materials_from_unknowns(state.theta)
-    lights = [descended.light for descended in state.likelihoods]
     light_values = [system.value for system in state.systems]
     if schedule.materials_fixed:  # those are φ
         light_values = list(map(LightLikelihood.marginal, state.likelihoods, state.systems))
     value = sum(light_values) + state.prior.value
-    return Fit(Point(materials, lights), hyperparameters, value, light_values, True)
+    return Fit(Point(materials, [each.light for each in state.likelihoods]), hyperparameters, value, light_values, True)
 
 
 def light_likelihood(

@@ -2,7 +2,7 @@
 
 A held-out photo takes no part in the solve, which predicts it.  If solved photos share its light, it has that light.
 Its exposure relative to them is that of EXIF or `known` where both have one, and else 1.  Otherwise its
-light is fitted to its own pixels with the materials fixed, so that it tests materials and shape alone.
+light is fitted to its own pixels and surroundings with the materials fixed, so that it tests materials and shape alone.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def fit_held_out_lights(
     materials = solution.point.materials
     problem = msgspec.structs.replace(problem, known=KnownValues(dict(enumerate(materials.rows()))))
     if not any(decision.accepted for decision in solution.backgrounds):
-        problem = problem.without_backgrounds()
+        problem = problem.keep_backgrounds([])
     run = FitRunner(prior=solution.prior)
     start = Point(materials, [constant_light(block, materials, options.cells) for block in problem.blocks])
     first = initial_fit(start)
@@ -55,13 +55,10 @@ def fit_held_out_lights(
     fit = run.fit("lights", request.light_problem(state), first, FROM_CONSTANT)
     steps = {name: STEPS[name] for name in ("background", "lights")}
     point = run.run_steps(steps, request, state.with_fit(fit)).fit.point
-    lobes: dict[str, Lobes] = {}
-    exposures: dict[str, Channels] = {}
-    for block, light in zip(problem.blocks, point.lights, strict=True):
-        lobes[block.name] = light.lobes.scale(block.unit)
-        factors = np.exp(light.log_exposure).tolist()
-        exposures |= {photo: (factor,) * 3 for photo, factor in zip(block.photos, factors, strict=True)}
-    return lobes, exposures
+    pairs = list(zip(problem.blocks, point.lights, strict=True))
+    lobes = {block.name: light.lobes.scale(block.unit) for block, light in pairs}
+    factors = [pair for block, light in pairs for pair in zip(block.photos, np.exp(light.log_exposure), strict=True)]
+    return lobes, {photo: vec3([factor] * 3) for photo, factor in factors}
 
 
 def predicted_exposures(

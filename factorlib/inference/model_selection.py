@@ -145,9 +145,16 @@ class Selection(msgspec.Struct, frozen=True):
     evidence: list[Decision]
 
 
-def relative_gain(decision: Decision) -> float:
-    """Return the decrease of the held-out loss by the richer model, as a share of the new loss."""
-    return (decision.held_out_loss_without or 0.0) / max(decision.held_out_loss_with or 1.0, 1e-12) - 1
+def gains(decision: Decision, least: float, negligible: float = 0.0) -> bool:
+    """Return True if the loss without the richer part is higher by more than a share of the loss with it.
+
+    Args:
+        decision: Losses with the part and without it.
+        least: Least share.
+        negligible: Loss that is added to both.
+    """
+    with_part, without = decision.held_out_loss_with or 0.0, decision.held_out_loss_without or 0.0
+    return without + negligible > (1 + least) * (with_part + negligible)
 
 
 def comparison_sample(problem: JointProblem, options: SolveOptions) -> JointProblem:
@@ -164,7 +171,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
         options: Options of the user.
         run_fit: Function that fits a model.
     """
-    sample = comparison_sample(problem, options).without_backgrounds().keep_grounds([])
+    sample = comparison_sample(problem, options).keep_backgrounds([]).keep_grounds([])
     hidden = any(block.visibility is not None for block in problem.blocks)
     shadows = options.self_shadowing if hidden else "off"
     bounces = options.interreflection if problem.has_bounces else "off"
@@ -244,7 +251,7 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
     if options.background == "off" or not any(candidates):
         return Selection(before, [Decision(False) for _ in candidates])
     sample = comparison_sample(problem, options)
-    without = sample.without_backgrounds()
+    without = sample.keep_backgrounds([])
     accepted = np.array(candidates)
     factors = np.zeros(len(candidates))
     fit = before
@@ -311,7 +318,7 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
     evidence = []
     for k, light in enumerate(curved.point.lights):
         decision = compare_models(losses_without.one_light(k), losses_with.one_light(k), CLEARLY_FOR)
-        accepted = decision.accepted and relative_gain(decision) > LEAST_TONE_GAIN and not light.implausible_tone
+        accepted = decision.accepted and gains(decision, LEAST_TONE_GAIN) and not light.implausible_tone
         evidence.append(Decision(True) if curved_before[k] else msgspec.structs.replace(decision, accepted=accepted))
     if all(decision.accepted for decision in evidence):
         return Selection(curved, evidence)
@@ -346,7 +353,9 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE
     ) -> Fit:
         """Return the fit with lights of these curvatures, by number of the light."""
-        return run_fit("distances", sample, start.with_curvatures(curvatures), schedule)
+        pairs = enumerate(start.point.lights)
+        lights = [msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature)) for k, light in pairs]
+        return run_fit("distances", sample, start.with_lights(lights), schedule)
 
     values = np.array([fit_with_curvatures(dict.fromkeys(candidates, c)).light_values for c in (0.0, *CURVATURES)])
     log_bayes_factors = (values[0] - values[1:]) / 2

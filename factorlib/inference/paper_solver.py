@@ -97,7 +97,7 @@ def solve_paper(
         options: Options.
         report: Called with each reported subset.
     """
-    problem = problem.with_effects(False, False).without_backgrounds()
+    problem = problem.with_effects(False, False).keep_backgrounds([])
     objective = PaperObjective(problem, materials, options)
     history = list[Event]()
     blocks = problem.blocks

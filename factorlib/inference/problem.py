@@ -118,10 +118,6 @@ class JointProblem(msgspec.Struct, frozen=True):
         pairs = zip(self.blocks, keep or [False] * len(self.blocks), strict=True)
         return self.with_blocks([b if kept else msgspec.structs.replace(b, **{part: None}) for b, kept in pairs])
 
-    def without_backgrounds(self) -> JointProblem:
-        """Return the problem without backgrounds."""
-        return self.keep_backgrounds([])
-
     def with_blocks(self, blocks: list[Block]) -> JointProblem:
         """Return the problem with other observations."""
         return msgspec.structs.replace(self, blocks=blocks)

@@ -34,7 +34,7 @@ from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light, UnitLobes
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import CLEARLY_AGAINST, WEAKLY_FOR, Losses, Selection, compare_models
+from factorlib.inference.model_selection import CLEARLY_AGAINST, WEAKLY_FOR, Losses, Selection, compare_models, gains
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import SUN
 from factorlib.results.materials import Decision
@@ -153,12 +153,12 @@ def accept_sun(cells: Illumination, sun: Illumination) -> Decision:
     least the share `LEAST_SUN_SHARE` of the light and be no bluer than all of it.
     """
     evidence = compare_illuminations(cells, sun, WEAKLY_FOR)
-    clear = (evidence.held_out_loss_without or 0.0) > (1 + LEAST_SUN_GAIN) * (evidence.held_out_loss_with or 0.0)
+    accepted = evidence.accepted and gains(evidence, LEAST_SUN_GAIN)
     energy = sun.light.energy[sun.light.suns].sum(0)
     total = sun.light.energy.sum(0)
     strong = energy.sum() >= LEAST_SUN_SHARE * total.sum()
     warm = energy[2] * total[0] <= total[2] * energy[0]
-    return msgspec.structs.replace(evidence, accepted=bool(evidence.accepted and clear and strong and warm))
+    return msgspec.structs.replace(evidence, accepted=bool(accepted and strong and warm))
 
 
 def _grid_around(z: Float[np.ndarray, "3"], radius: float, step: float) -> Float[np.ndarray, "q 3"]:

@@ -32,7 +32,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.conjugate_gradients import solve_by_gradients
-from factorlib.inference.model_selection import CLEARLY_FOR, Losses, compare_models
+from factorlib.inference.model_selection import CLEARLY_FOR, Losses, compare_models, gains
 from factorlib.results.materials import Decision
 
 STIFFNESSES = (3.0, 1.0, 0.3, 0.1, 0.03)  # a of (2), from stiff to soft
@@ -159,19 +159,15 @@ def select_texture(
         textures = [solve_texture(other, laplacian, stiffness, texture) for other, texture in pairs]
         losses = [samples[k].losses(samples[k].operator @ textures[k % folds], shared[k]) for k in predicted]
         evidence = compare_models(flat, Losses(losses, clusters), CLEARLY_FOR)
-        evidence = msgspec.structs.replace(evidence, accepted=evidence.accepted and is_visible(evidence))
+        evidence = msgspec.structs.replace(
+            evidence, accepted=evidence.accepted and gains(evidence, LEAST_GAIN, INVISIBLE)
+        )
         if best is not None and (evidence.held_out_loss_with or 0) >= (best[0].held_out_loss_with or 0):
             break
         best = evidence, stiffness
     assert best is not None
     texture = solve_texture(samples, laplacian, best[1]) if best[0].accepted else None
     return texture, best[0], best[1]
-
-
-def is_visible(evidence: Decision) -> bool:
-    """Return True if the loss of the flat colour is more than `LEAST_GAIN` larger, beyond invisible paint."""
-    without, with_texture = (evidence.held_out_loss_without or 0.0), (evidence.held_out_loss_with or 0.0)
-    return without + INVISIBLE > (1 + LEAST_GAIN) * (with_texture + INVISIBLE)
 
 
 def flat_colour(samples: Sequence[TextureSamples]) -> Float[np.ndarray, "1 3"]:

@@ -44,7 +44,6 @@ Lights      Given the materials, log radiance of a light has the covariance Σ =
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -119,22 +118,6 @@ def estimate_uncertainty(
     return errors, Posterior(light_sample, solution.fit, solution.prior, tick).relative_standard_errors()
 
 
-class MaterialCovariance(NamedTuple):
-    """Covariance of reflectances and roughnesses, in the gauge.
-
-    Attributes:
-        by_fit: Covariance by the observations as the fit weighs them, with independent noise.
-        by_data: Covariance by the observations: the widest of `by_fit` and (1).
-        by_normals: Covariance by errors of normals, (2).
-        deviation: Deviation of the whitened residuals.
-    """
-
-    by_fit: Float[np.ndarray, "k k"]
-    by_data: Float[np.ndarray, "k k"]
-    by_normals: Float[np.ndarray, "k k"]
-    deviation: float
-
-
 class Posterior:
     """Posterior of materials and lights at the fit of a joint solve.
 
@@ -168,8 +151,12 @@ class Posterior:
         illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
-    def covariance(self) -> MaterialCovariance:
-        """Return the covariance of reflectances and roughnesses."""
+    def covariances(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]:
+        """Return three covariances of reflectances and roughnesses, in the gauge.
+
+        The first is that by the observations as the fit weighs them, with independent noise; the second the widest of
+        it and (1).  The third is that by errors of normals, (2).
+        """
         materials = self.materials
         values = by_unknowns(materials).reshape(-1)
         # S, s_k and d_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
@@ -180,12 +167,12 @@ class Posterior:
         covariance = widest_covariance(inverse, clusters, materials, self.problem)
         turns = [turn / values for light_scores in scores for turn in light_scores[1:]]
         by_turns = np.vstack([np.zeros((0, len(values))), *turns]) @ inverse
-        normals = project_to_gauge(by_turns.T @ by_turns, materials, self.problem)
-        return MaterialCovariance(by_fit, covariance, normals, residual_deviation(self.problem, self.fit.point))
+        return by_fit, covariance, project_to_gauge(by_turns.T @ by_turns, materials, self.problem)
 
     def standard_errors(self) -> MaterialErrors:
         """Return the standard error of every material unknown by the observations alone."""
-        _, by_data, by_normals, deviation = self.covariance()
+        _, by_data, by_normals = self.covariances()
+        deviation = residual_deviation(self.problem, self.fit.point)
         free = self.problem.known.free(len(self.materials)).reshape(-1, 7)
         model_errors = free * deviation * MODEL_ERROR * by_unknowns(self.materials)
         # an error is at most the width of its unknown's range
@@ -194,7 +181,8 @@ class Posterior:
 
     def with_prior(self) -> tuple[Materials, MaterialErrors]:
         """Return the materials by `factorlib.inference.material_posterior`, and their standard errors."""
-        *covariances, deviation = self.covariance()
+        covariances = self.covariances()
+        deviation = residual_deviation(self.problem, self.fit.point)
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, 7)

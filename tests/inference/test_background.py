@@ -114,7 +114,7 @@ def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_
 @pytest.mark.long
 def test_where_no_background_is_kept_the_answer_is_that_without_backgrounds(lit):
     doubtful = lit.with_blocks([darkened(block) for block in lit.blocks]).keep_backgrounds([False, True, False])
-    with_one, without = (solve(each, start_from_photos(3), QUICK) for each in (doubtful, lit.without_backgrounds()))
+    with_one, without = (solve(each, start_from_photos(3), QUICK) for each in (doubtful, lit.keep_backgrounds([])))
     assert with_one.backgrounds[1].log_bayes_factor < 0 and not with_one.backgrounds[1].accepted
     np.testing.assert_array_equal(with_one.point.materials.rows(), without.point.materials.rows())
 
@@ -128,7 +128,7 @@ def test_a_held_out_photo_gets_its_light_as_the_solve_does(lit, monkeypatch):
     dark = lit.with_blocks([darkened(lit.blocks[2])])
     given, without, doubtful = (
         fit_held_out_lights(each, solution, QUICK)[0]["room2"].weight
-        for each in (alone, alone.without_backgrounds(), dark)
+        for each in (alone, alone.keep_backgrounds([]), dark)
     )
     np.testing.assert_allclose(doubtful, without, rtol=0.02)
     assert np.abs(np.log(given / without)).max() > 0.1 and schedules[-1] is LIGHTS
@@ -137,10 +137,10 @@ def test_a_held_out_photo_gets_its_light_as_the_solve_does(lit, monkeypatch):
 def test_the_factor_of_a_component_is_free_unless_a_background_fixes_it(lit):
     names = [block.name for block in lit.blocks]
     assert not has_free_factor(lit.blocks, names)
-    assert has_free_factor(lit.without_backgrounds().blocks, names)
+    assert has_free_factor(lit.keep_backgrounds([]).blocks, names)
 
 
 def test_the_solver_of_the_paper_ignores_backgrounds_and_keeps_its_gauge(lit):
     quick = PaperOptions(lobes=4, samplings=0.5)
-    with_them, without = (solve_paper(each, 3, quick) for each in (lit, lit.without_backgrounds()))
+    with_them, without = (solve_paper(each, 3, quick) for each in (lit, lit.keep_backgrounds([])))
     np.testing.assert_array_equal(with_them.point.materials.rows(), without.point.materials.rows())

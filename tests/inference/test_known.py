@@ -323,12 +323,12 @@ def test_errors_of_normals_are_how_far_materials_move_when_normals_turn(monkeypa
                 step = np.linalg.solve(hessian, change)[:21] / angle * NORMAL_ERROR * np.sqrt(1 / c - 1)
                 expected += np.outer(step, step)
     expected = project_to_gauge(expected * np.outer(values, values), MATERIALS, problem)
-    given = posterior.covariance().by_normals
+    given = posterior.covariances()[2]
     assert np.diag(expected)[[7, 14, 20]].min() > 0
     np.testing.assert_allclose(given, expected, atol=0.02 * np.abs(expected).max())
     np.testing.assert_allclose(np.diag(given), np.diag(expected), rtol=0.05)
     certain = problem.with_blocks([replaced(block, confidence=np.ones(len(block))) for block in problem.blocks])
-    assert not Posterior(certain, fit, PRIOR).covariance().by_normals.any()
+    assert not Posterior(certain, fit, PRIOR).covariances()[2].any()
 
 
 # ── what is said of the lights' colour ──────────────────────────────────────────────────────────────────────────────
