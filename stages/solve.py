@@ -79,7 +79,7 @@ class Params(options.SolveOptions, frozen=True, forbid_unknown_fields=True):
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 2.0
     """Angle, in degrees.  Observations of one material and photo whose normals and views differ by less are merged."""
     held_out: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.1
-    """Share of held-out observations: they are not fitted, and choose the model."""
+    """Share of held-out observations: they choose the model, and are fitted after that (not by the paper's)."""
     paper_lobes: options.Lobes = PAPER.lobes
     """Number of an illumination's lobes, for the paper's solver."""
     paper_samplings: Samplings = PAPER.samplings

@@ -14,7 +14,7 @@ import numpy as np
 
 from factorlib.inference.fit import FitSchedule, initial_fit
 from factorlib.inference.fit_runner import FitRunner, Solution, SolveState
-from factorlib.inference.joint_solver import STEPS, SolveRequest
+from factorlib.inference.joint_solver import CHOICES, FITS, SolveRequest
 from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Point
 from factorlib.inference.options import SolveOptions
@@ -53,7 +53,7 @@ def fit_held_out_lights(
     state = SolveState(first, first, solution.shadows, solution.interreflection, observations=solution.observations)
     request = SolveRequest(problem, [first], options, run)
     fit = run.fit("lights", request.light_problem(state), first, FROM_CONSTANT)
-    steps = {name: STEPS[name] for name in ("background", "lights")}
+    steps = {"background": CHOICES["background"], "lights": FITS["lights"]}
     point = run.run_steps(steps, request, state.with_fit(fit)).fit.point
     pairs = list(zip(problem.blocks, point.lights, strict=True))
     lobes = {block.name: light.lobes.scale(block.unit) for block, light in pairs}

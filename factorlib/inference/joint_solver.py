@@ -9,6 +9,7 @@ distances   Marginal likelihoods choose distances of lights.
 ground      Shadows on the ground are observations of a light too, where they lie as the objects say.  They are modelled
             as those of an infinitely distant light, so they do not choose distances.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
+            From here on held-out observations are fitted too: left out, they would leave holes in the lights.
 splitting   The 24 cells with most of a light's energy split in about four while the log Bayes factor for that is very
             strong (`factorlib.inference.splitting`).  In a light blurred by large cells, materials come out too smooth.
 prior       Each material is estimated again under the prior on materials, with the errors of the model in its
@@ -87,7 +88,9 @@ def solve(
     """
     run = run or FitRunner()
     request = SolveRequest(problem, initial_fits(problem, start, options), options, run)
-    state = run.run_steps(STEPS, request, SolveState(request.starts[0], request.starts[0]))
+    state = run.run_steps(CHOICES, request, SolveState(request.starts[0], request.starts[0]))
+    request = msgspec.structs.replace(request, problem=problem.with_all_fitted())
+    state = run.run_steps(FITS, request, state)
     answer = fix_gauge(state.fit.point, state.effective_problem(problem).blocks, problem.known)
     point = Point(problem.known.insert_into(answer.materials), answer.lights)
     steps = {name: getattr(state, name) for name in SolveState.__struct_fields__}
@@ -168,12 +171,15 @@ def choose_suns(request: SolveRequest, state: SolveState) -> SolveState:
     return msgspec.structs.replace(state, fit=selection.fit, suns=selection.evidence)
 
 
-STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
+Steps = dict[str, Callable[[SolveRequest, SolveState], SolveState]]
+CHOICES: Steps = {
     "effects": choose_effects,
     "background": choose_backgrounds,
     "tone": choose_tone,
     "distances": choose_distances,
     "ground": choose_grounds,
+}
+FITS: Steps = {
     "materials": fit_materials,
     "splitting": choose_splittings,
     "prior": apply_prior,

@@ -97,6 +97,10 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Return the problem without its held-out observations."""
         return self.with_blocks([block.without_held_out() for block in self.blocks])
 
+    def with_all_fitted(self) -> JointProblem:
+        """Return the problem with its held-out observations among the fitted ones."""
+        return self.with_blocks([msgspec.structs.replace(b, held_out=np.zeros_like(b.held_out)) for b in self.blocks])
+
     def select_lights(self, lights: Sequence[int]) -> JointProblem:
         """Return the problem with the selected blocks alone."""
         return self.with_blocks([self.blocks[k] for k in lights])

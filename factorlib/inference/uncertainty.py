@@ -110,6 +110,8 @@ def estimate_uncertainty(
     if not len(errors.materials):  # of the paper's solver, which has no prior
         sample = reliable_observations(problem).subsample(solution.observations, options.seed)
         errors = Posterior(sample, solution.materials, solution.prior, tick).standard_errors()
+    else:
+        problem = problem.with_all_fitted()
     # errors in proportion to reflectances, whose scale is that of the answer
     fitted = np.maximum(solution.fit.point.materials.rows(), LEAST_REFLECTANCE)
     in_gauge = errors.materials.rows() * (solution.point.materials.rows() / fitted)

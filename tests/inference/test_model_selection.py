@@ -270,6 +270,25 @@ def test_models_that_predict_the_same_are_equal_evidence(begun_rooms, monkeypatc
         assert decision.margin == pytest.approx(0, abs=1e-6)
 
 
+def test_what_is_held_out_judges_the_choices_and_is_fitted_after_them(monkeypatch):
+    """Else a light would have holes there."""
+    fit, fitted = FitRunner.fit, {}
+
+    def recorded(self, phase, problem, *how):
+        fitted.setdefault(phase, set()).add(problem.none_held_out)
+        return fit(self, phase, problem, *how)
+
+    monkeypatch.setattr(FitRunner, "fit", recorded)
+    solve(JointProblem(rooms(), OPERATOR), start_from_photos(3), QUICK)
+    assert fitted == {
+        "no shadows": {False},
+        "tone curves": {False},
+        "materials and lights": {True},
+        "lights": {True},
+        "suns": {True},
+    }
+
+
 def test_one_cluster_is_no_evidence():
     """Its losses have no standard error: a change of 0.05 % had a margin of 5e8."""
     one, other = (Losses([np.full(20, value)], [np.zeros(20, int)]) for value in (1.0005, 1.0))
@@ -329,6 +348,7 @@ def test_standard_errors_are_relative_to_the_reflectances_of_the_answer():
     answer, fitted = solution.point.materials, solution.fit.point.materials
     assert np.abs(np.log(answer.specular / fitted.specular)).max() > 0.02  # the gauges differ
     errors, maps = estimate_uncertainty(solution, problem, QUICK)
+    problem = problem.with_all_fitted()
     sample = reliable_observations(problem).subsample(QUICK.observations, QUICK.seed)
     own = Posterior(sample, solution.materials, prior).with_prior()[1].materials
     for name in ("diffuse", "specular"):
