@@ -139,10 +139,6 @@ class Block(msgspec.Struct, frozen=True):
             self, **{name: values_of_column[rows] for name, values_of_column in values if values_of_column is not None}
         )
 
-    def without_held_out(self) -> Block:
-        """Return the observations that are not held out."""
-        return self.take(~self.held_out) if self.held_out.any() else self
-
     def subsample(self, count: int, seed: int) -> Block:
         """Return at most `count` fitted and `count` held-out observations, in their order.
 

@@ -51,16 +51,16 @@ EventReport = Callable[[Event], None]
 Progress = Callable[[float, float, str], None]  # amount done, total amount, and the current activity
 # Typical number of evaluations of each phase, and the cost of one relative to the first phase's, on data/eames.
 PHASES = {
-    "shadows": (13, 1),
-    "no shadows": (8, 1),
-    "shadows and bounces": (8, 1),
-    "background": (28, 1),
-    "tone curves": (6, 1),
-    "distances": (24, 1.5),
-    "materials and lights": (11, 7),
+    "shadows": (9, 1),
+    "no shadows": (9, 1),
+    "shadows and bounces": (14, 1),
+    "background": (9, 1),
+    "tone curves": (9, 1),
+    "distances": (25, 1.5),
+    "materials and lights": (10, 7),
 }
 SPLITTING = (7, 9)
-LAST = {"prior": (1, 3), "lights": (3, 14), "suns": (4, 10)}
+LAST = {"prior": (1, 3), "lights": (5, 14), "suns": (12, 10)}
 
 
 # Factor on the number of observations where materials are given: +0.25 dB on data/eames, +0.27 on the made set of 101.

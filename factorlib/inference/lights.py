@@ -94,11 +94,6 @@ class Light(msgspec.Struct, frozen=True):
         return ~self.fixed if len(self.fixed) else np.ones(len(self), bool)
 
     @property
-    def is_near(self) -> bool:
-        """True if the light is at a finite distance."""
-        return self.curvature > 0
-
-    @property
     def sharpness(self) -> Float[np.ndarray, " p"]:
         """Sharpness λ of each lobe."""
         return np.exp(self.log_sharpness)

@@ -343,8 +343,8 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         run_fit: Function that fits a model.
     """
     pairs = enumerate(zip(before.point.lights, problem.blocks, strict=True))
-    candidates = [k for k, (light, block) in pairs if not (light.is_near or light.fixed.any() or block.place is None)]
-    evidence = [Decision(light.is_near) for light in before.point.lights]
+    candidates = [k for k, (light, block) in pairs if not (light.curvature or light.fixed.any() or block.place is None)]
+    evidence = [Decision(light.curvature > 0) for light in before.point.lights]
     if options.distance == "off" or not candidates:
         return Selection(before, evidence)
     sample = comparison_sample(problem, options)

@@ -95,7 +95,7 @@ class JointProblem(msgspec.Struct, frozen=True):
 
     def without_held_out(self) -> JointProblem:
         """Return the problem without its held-out observations."""
-        return self.with_blocks([block.without_held_out() for block in self.blocks])
+        return self.with_blocks([b.take(~b.held_out) if b.held_out.any() else b for b in self.blocks])
 
     def with_all_fitted(self) -> JointProblem:
         """Return the problem with its held-out observations among the fitted ones."""

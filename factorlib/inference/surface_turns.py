@@ -34,12 +34,11 @@ from scipy.sparse.linalg import LinearOperator
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, face_normals
 from factorlib.inference.blocks import FIT_LOSS, Block
-from factorlib.inference.conjugate_gradients import solve_by_gradients
 from factorlib.inference.fit import Hyperparameters, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.light.prior import LightPrior
 from factorlib.meshes.mesh import scale_mesh
-from factorlib.meshes.subdivision import SubdividedMesh
+from factorlib.meshes.subdivision import SubdividedMesh, solve_by_gradients
 from factorlib.results.poses import ObjectPose
 
 LARGEST_TURN = 0.6  # largest |n' − n|: 35°

@@ -31,8 +31,8 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array, eye_array
 
 from factorlib.inference.blocks import RobustLoss
-from factorlib.inference.conjugate_gradients import solve_by_gradients
 from factorlib.inference.model_selection import CLEARLY_FOR, Losses, compare_models, gains
+from factorlib.meshes.subdivision import solve_by_gradients
 from factorlib.results.materials import Decision
 
 STIFFNESSES = (3.0, 1.0, 0.3, 0.1, 0.03)  # a of (2), from stiff to soft

@@ -1,4 +1,4 @@
-"""Subdivided mesh with vertices close enough together to carry detail, and differential operators on it.
+"""Subdivided mesh with vertices close enough together to carry detail, differential operators on it, and a solver.
 
 Its vertices are those of the mesh and of its subdivision. Every edge longer than a threshold is halved. A triangle with
 one, two or three such edges becomes two, three or four, so that neighbours agree along every edge and a closed mesh
@@ -6,21 +6,25 @@ stays closed. Vertices at one position are one node, on whichever side of a crea
 position.
 """
 
+import logging
+
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array, eye_array
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import LinearOperator, cg, spsolve
 from scipy.spatial import cKDTree
 
 from factorlib.meshes.mesh import Mesh, area_vectors, weld_vertices
 
+log = logging.getLogger("factorlib.meshes")
 LONGEST = 0.04  # longest edge after subdivision, in units of the mesh's extent
 LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the gradient's
 THIN = 0.06  # greatest thickness of a thin part, in units of the extent; displacements are a third of it
 OPPOSITE = -0.5  # largest cosine between normals of opposite sides
 MOST_INWARD = 0.45  # largest displacement inward, in units of the thickness
 UNSEEN = 0.05  # weight of the gradient where no photo sees the surface
+MOST_ITERATIONS = 300  # of conjugate gradients
 
 
 def subdivide(mesh: Mesh, longest: float) -> Mesh:
@@ -196,3 +200,27 @@ def subdivided_mesh(mesh: Mesh, longest: float = LONGEST) -> SubdividedMesh:
     dense = subdivide(mesh, longest * extent)
     node = weld_vertices(dense.vertices)
     return SubdividedMesh(dense, node, node[dense.faces], extent)
+
+
+def solve_by_gradients(
+    system: LinearOperator | csr_array,
+    target: Float[np.ndarray, " n"],
+    diagonal: Float[np.ndarray, " n"],
+    tolerance: float,
+    start: Float[np.ndarray, " n"] | None = None,
+) -> Float[np.ndarray, " n"]:
+    """Return the solution of a positive definite system; a warning says if it is not within the tolerance.
+
+    Args:
+        system: Matrix, or its product with a vector.
+        target: Right-hand side.
+        diagonal: Diagonal of the matrix, the preconditioner (Jacobi).
+        tolerance: Largest residual, as a share of the right-hand side.
+        start: First guess; None for 0.
+    """
+    inverse = diags_array(1 / diagonal)
+    solution, status = cg(system, target, x0=start, rtol=tolerance, maxiter=MOST_ITERATIONS, M=inverse)
+    if status:
+        text = "conjugate gradients did not converge in %d iterations: the detail of %d unknowns is only approximate"
+        log.warning(text, MOST_ITERATIONS, len(target))
+    return solution

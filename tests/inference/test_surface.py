@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.inference import conjugate_gradients, forward, surface_turns
+from factorlib.inference import forward, surface_turns
 from factorlib.inference.blocks import FIT_LOSS
 from factorlib.inference.fit import Hyperparameters, light_likelihood
 from factorlib.inference.materials import Point
@@ -28,6 +28,7 @@ from factorlib.inference.surface_turns import (
     linearise_light,
     solve_detail,
 )
+from factorlib.meshes import subdivision
 from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
 from factorlib.results.poses import ObjectPose, pose_fields
@@ -100,7 +101,7 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
 def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monkeypatch):
     # the accuracy in use leaves what lights explain as well: all factors together
     monkeypatch.setattr(surface_turns, "CG_TOLERANCE", 1e-7)
-    monkeypatch.setattr(conjugate_gradients, "MOST_ITERATIONS", 2000)
+    monkeypatch.setattr(subdivision, "MOST_ITERATIONS", 2000)
     problem, _, body = *photographed(2, 2, size=9), surfaces(1)
     problem = with_wrong_normals(problem, 0.1)
     fit, random = begun(problem), np.random.default_rng(1)

@@ -6,8 +6,9 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from factorlib.generate.solids import sphere
-from factorlib.inference import conjugate_gradients, texture
+from factorlib.inference import texture
 from factorlib.inference.texture import PULL, TextureSamples, observe_texture, select_texture, solve_texture
+from factorlib.meshes import subdivision
 from factorlib.meshes.subdivision import subdivided_mesh
 
 BODY = subdivided_mesh(sphere(1.0), 0.08)
@@ -58,7 +59,7 @@ def test_one_photo_is_no_evidence():
 def test_a_texture_that_is_not_solved_to_its_tolerance_is_said(monkeypatch, caplog):
     solve_texture([pixels(PAINT, 0)], LAPLACIAN, 0.1)
     assert not caplog.text
-    monkeypatch.setattr(conjugate_gradients, "MOST_ITERATIONS", 2)
+    monkeypatch.setattr(subdivision, "MOST_ITERATIONS", 2)
     solve_texture([pixels(PAINT, 0)], LAPLACIAN, 0.1)
     assert "did not converge in 2 iterations" in caplog.text
 
@@ -66,7 +67,7 @@ def test_a_texture_that_is_not_solved_to_its_tolerance_is_said(monkeypatch, capl
 def test_the_texture_is_the_minimum_of_its_system(monkeypatch):
     monkeypatch.setattr(texture, "REWEIGHTINGS", 0)
     monkeypatch.setattr(texture, "CG_TOLERANCE", 1e-10)
-    monkeypatch.setattr(conjugate_gradients, "MOST_ITERATIONS", 5000)
+    monkeypatch.setattr(subdivision, "MOST_ITERATIONS", 5000)
     samples = [pixels(PAINT, seed, count=500) for seed in (0, 1)]
     system = csc_array(0.3 * LAPLACIAN + PULL * eye_array(BODY.nodes))
     target = np.full((BODY.nodes, 3), PULL)
