@@ -136,10 +136,9 @@ def fit_problem(
     # a first guess descends without ε: classes of one tint, such as fabrics, would hold both parts at one
     material_prior = partial(MaterialPrior, materials, problem.blocks, problem.known)
     descent = Descent(material_prior(one_tint=start.fitted), problem.spread, report, problem.known.free(len(materials)))
-    illuminations = problem.illuminations(Point(materials, start.point.lights))
     with_table = partial(light_likelihood, prior=prior, materials_given=schedule.materials_fixed, tables=problem.tables)
-    pairs = list(zip(illuminations, hyperparameters, strict=True))
-    likelihoods = list(problem.spread(lambda pair: with_table(*pair), pairs))
+    pairs = zip(problem.illuminations(Point(materials, start.point.lights)), hyperparameters, strict=True)
+    likelihoods = list(problem.spread(lambda pair: with_table(*pair), list(pairs)))
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
     estimate = partial(estimate_hyperparameters, least=schedule.least_temperature, factor=schedule.temperature_factor)
     for number, iterations in enumerate(schedule.descents):
@@ -147,8 +146,8 @@ def fit_problem(
             descent = msgspec.structs.replace(descent, prior=material_prior())
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
-            solved = list(zip(state.likelihoods, state.systems, strict=True))
-            hyperparameters = list(problem.spread(lambda pair: estimate(*pair), solved))
+            solved = zip(state.likelihoods, state.systems, strict=True)
+            hyperparameters = list(problem.spread(lambda pair: estimate(*pair), list(solved)))
             illuminations = [likelihood.illumination for likelihood in state.likelihoods]
             state = state._replace(likelihoods=list(map(with_table, illuminations, hyperparameters)))
         if schedule.materials_fixed:
@@ -157,11 +156,11 @@ def fit_problem(
             state = descent.linearise(state.likelihoods, state.theta)
             state = descent.descend_jointly(balance_exposures(state, descent, problem.known), iterations)
             state = balance_exposures(state, descent, problem.known)
-    if not schedule.materials_fixed:
-        materials = materials_from_unknowns(state.theta)
-    light_values = [system.value for system in state.systems]
-    if schedule.materials_fixed:  # those are φ
+    if schedule.materials_fixed:  # values of systems are φ
         light_values = list(map(LightLikelihood.marginal, state.likelihoods, state.systems))
+    else:
+        materials = materials_from_unknowns(state.theta)
+        light_values = [system.value for system in state.systems]
     value = sum(light_values) + state.prior.value
     return Fit(Point(materials, [each.light for each in state.likelihoods]), hyperparameters, value, light_values, True)
 

@@ -89,9 +89,8 @@ def material_posterior(
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x
-    by_prior = mixture.evaluate(result)[2]
     variance = np.zeros(7)
-    variance[free] = np.diag(np.linalg.inv(precision + by_prior[np.ix_(free, free)]))
+    variance[free] = np.diag(np.linalg.inv(precision + mixture.evaluate(result)[2][np.ix_(free, free)]))
     share = np.where(free, 1 - variance / np.diag(limited), 0.0).clip(0, 1)
     # no prior bears on k_d, whose deviation is therefore not limited
     posterior_deviation = np.where(np.arange(7) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))
