@@ -142,8 +142,7 @@ def fit_problem(
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
     estimate = partial(estimate_hyperparameters, least=schedule.least_temperature, factor=schedule.temperature_factor)
     for number, iterations in enumerate(schedule.descents):
-        if number == 1:
-            descent = msgspec.structs.replace(descent, prior=material_prior())
+        descent = msgspec.structs.replace(descent, prior=material_prior(one_tint=start.fitted or number > 0))
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
             solved = zip(state.likelihoods, state.systems, strict=True)
