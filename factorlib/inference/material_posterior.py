@@ -2,18 +2,19 @@
 
 A fit weighs observations as if the model were exact but for independent noise, so that a wrong mesh can outweigh any
 prior: stone becomes enamel.  Once the errors of the model are known (`factorlib.inference.uncertainty`), each material
-is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, and A⁻¹ its covariance as the fit weighs its
-observations.  S is the covariance by the observations with correlated errors, at least A⁻¹, and M that of errors of
-normals and of the model.  p is the mixture of classes of `factorlib.inference.material_prior`.  θ minimises
+is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, A⁻¹ its covariance as the fit weighs its
+observations, and M that of errors of normals and of the model.  p is the mixture of classes of
+`factorlib.inference.material_prior`.  θ minimises
 
-    (θ − θ₀)ᵀ (S + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + A⁻¹ g                                   (1)
+    (θ − θ₀)ᵀ (A⁻¹ + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + A⁻¹ g                                 (1)
 
-with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior against A, where A (θ̂ − θ₀) + g = 0, and θ₀ is
-the estimate of the observations without it.  So where errors are as the fit assumes (S = A⁻¹, M = 0) θ̂ stays.  S
-couples k_d to k_s, so k_d follows.  The covariance
-is ((S + M)⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior is one
-less the ratio of its variance to that in S + M.  The mixture is without ε, which is a term of the fit.  Here it would
-move sums of k_d and k_s that the observations determine.
+with g half the gradient of −2 log p at θ̂.  θ̂ already weighs the prior against A, so that A (θ̂ − θ₀) + g = 0, and θ₀ is
+the estimate of the observations without it.  So without errors of the model (M = 0) θ̂ stays.  A⁻¹ couples k_d to k_s,
+so k_d follows.  Standard errors are wider: in them S, the widest estimate of the covariance by the observations, takes
+the place of A⁻¹.  S is an upper bound from few clusters, by which an estimate would leave what is observed.  The
+covariance is ((S + M)⁻¹ + P)⁻¹, with P half the Hessian of −2 log p.  The share of an unknown that comes from the prior
+is one less the ratio of its variance to that in S + M.  The mixture is without ε, which is a term of the fit.  Here it
+would move sums of k_d and k_s that the observations determine.
 """
 
 from __future__ import annotations
@@ -69,10 +70,10 @@ def material_posterior(
     if not free[3:].any():
         return MaterialPosterior(fitted, deviation, np.zeros(7))
     mixture = Mixture(classes_of(name), one_tint=False)
-    # θ₀ of (1), and S + M
-    center = fitted + np.where(free, limit_deviations(fit_covariance) @ (free * mixture.evaluate(fitted)[1]), 0.0)
-    limited = limit_deviations(covariance) + model_covariance
-    precision = np.linalg.inv(limited[np.ix_(free, free)])
+    # θ₀ and (A⁻¹ + M)⁻¹ of (1)
+    spread = limit_deviations(fit_covariance)
+    center = fitted + np.where(free, spread @ (free * mixture.evaluate(fitted)[1]), 0.0)
+    precision = np.linalg.inv((spread + model_covariance)[np.ix_(free, free)])
     bounds = [(low, max(high, fitted[k])) for k, (low, high) in enumerate(BOUNDS) if free[k]]
 
     def objective(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
@@ -83,14 +84,17 @@ def material_posterior(
         energy, slope, _, _ = mixture.evaluate(full)
         return float(off @ precision @ off) + energy, 2 * (precision @ off + slope[free])
 
-    # (1) has several minima.  S is valid near the fit only, so classes are other starts only where M exceeds S
-    far = (np.diag(model_covariance) > np.diag(covariance))[3:].any()
+    # (1) has several minima.  A⁻¹ is valid near the fit only, so classes are other starts only where M exceeds it
+    far = (np.diag(model_covariance) > np.diag(fit_covariance))[3:].any()
     starts = [fitted, *(np.append(fitted[:3], mean) for mean in mixture.mean if far)]
     minima = [minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = fitted.copy()
     result[free] = min(minima, key=lambda minimum: minimum.fun).x
+    # ((S + M)⁻¹ + P)⁻¹
+    limited = limit_deviations(covariance) + model_covariance
+    rows = np.ix_(free, free)
     variance = np.zeros(7)
-    variance[free] = np.diag(np.linalg.inv(precision + mixture.evaluate(result)[2][np.ix_(free, free)]))
+    variance[free] = np.diag(np.linalg.inv(np.linalg.inv(limited[rows]) + mixture.evaluate(result)[2][rows]))
     share = np.where(free, 1 - variance / np.diag(limited), 0.0).clip(0, 1)
     # no prior bears on k_d, whose deviation is therefore not limited
     posterior_deviation = np.where(np.arange(7) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))

@@ -54,20 +54,23 @@ def test_without_errors_of_the_model_a_fit_under_the_prior_stays(seed):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_correlated_errors_give_the_prior_more_weight_about_the_estimate_without_it(seed):
-    """The fit weighed its prior against its own covariance, and not against the wider one."""
-    sigma = random_covariance(seed)
+def test_a_wider_covariance_than_the_fit_weighs_widens_errors_and_moves_nothing(seed):
+    """The fit weighed its prior against its own covariance; errors of the model give the prior its say."""
+    sigma, errors = random_covariance(seed), covariance([0.0] * 3 + [0.3] * 3 + [0.1])
     starts = [ENAMEL, *(np.append(ENAMEL[:3], mean) for mean in CLASSES.mean)]
 
     def least(precision: np.ndarray, start: np.ndarray):
-        return minimize(
-            lambda x: (x - ENAMEL) @ precision @ (x - ENAMEL) + CLASSES.evaluate(x)[0], start, bounds=BOUNDS, tol=1e-12
-        )
+        def energy(x: np.ndarray) -> float:
+            return (x - ENAMEL) @ precision @ (x - ENAMEL) + CLASSES.evaluate(x)[0]
 
-    fit = least(np.linalg.inv(sigma), ENAMEL)
-    expected = min((least(np.linalg.inv(2 * sigma), start) for start in (fit.x, *starts)), key=lambda one: one.fun)
-    posterior = material_posterior(fit.x, sigma, 2 * sigma, NO_ERROR, ALL)
-    np.testing.assert_allclose(posterior.theta, expected.x, atol=2e-3)
+        return minimize(energy, start, bounds=BOUNDS, tol=1e-12)
+
+    fit = least(np.linalg.inv(sigma), ENAMEL).x
+    expected = min((least(np.linalg.inv(sigma + errors), start) for start in (fit, *starts)), key=lambda one: one.fun)
+    posterior = material_posterior(fit, sigma, 4 * sigma, errors, ALL)
+    assert CLASSES.evaluate(posterior.theta)[0] == pytest.approx(CLASSES.evaluate(expected.x)[0], abs=0.01)
+    np.testing.assert_allclose(posterior.theta, expected.x, atol=5e-3)
+    assert (posterior.deviation > posterior_of(fit, sigma, errors, ALL).deviation).all()
 
 
 def test_where_the_model_is_wrong_the_material_is_a_likely_one():
