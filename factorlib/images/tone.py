@@ -82,8 +82,8 @@ Curve = Callable[[Values], Values]  # from encoded values to linear ones
 def srgb_decode(encoded: Values) -> Values:
     """Convert sRGB-encoded values to linear ones.
 
-    >>> srgb_decode(np.array([0.0, 0.04045, 0.5, 1.0])).round(6).tolist()
-    [0.0, 0.003131, 0.214041, 1.0]
+    >>> srgb_decode(np.array([0.0, 0.04045, 0.5, 1.0])).round(7).tolist()
+    [0.0, 0.0031308, 0.2140411, 1.0]
     """
     size = np.abs(encoded)
     return np.copysign(np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4), encoded)

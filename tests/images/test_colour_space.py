@@ -3,9 +3,9 @@
 import io
 import struct
 import zlib
+from itertools import accumulate
 
 import numpy as np
-import OpenImageIO as oiio
 import pillow_heif
 import pytest
 from PIL import Image
@@ -13,7 +13,8 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from factorlib.images.photo import open_photo, read_photo
 from factorlib.images.tone import srgb_decode, srgb_encode
-from tests.images.test_photo import codes
+from tests.faults import sample
+from tests.images.test_photo import codes, save
 from tests.refusal import refusal
 
 # XYZ (D65) of linear RGB, CSS Color Module Level 4, section 17
@@ -40,12 +41,11 @@ def icc(space, *curves, model=b"RGB ", names=(b"rTRC", b"gTRC", b"bTRC"), **furt
     xyz = [b"XYZ \0\0\0\0" + np.rint(65536 * c).astype(">i4").tobytes() for c in (D50_FROM_D65 @ space).T]
     tags = {**dict(zip((b"rXYZ", b"gXYZ", b"bXYZ"), xyz)), **dict(zip(names, curves * 3))}
     tags |= {name.encode(): tag for name, tag in further.items()}
-    at, table, body = 132 + 12 * len(tags), b"", b""
-    for name, tag in tags.items():
-        table += name + struct.pack(">II", at + len(body), len(tag))
-        body += tag + b"\0" * (-len(tag) % 4)
-    size, head = struct.pack(">I", at + len(body)), b"\0" * 4 + b"\2\x10\0\0mntr" + model + b"XYZ "
-    return size + head + b"\0" * 12 + b"acsp" + b"\0" * 88 + struct.pack(">I", len(tags)) + table + body
+    padded = [tag + b"\0" * (-len(tag) % 4) for tag in tags.values()]
+    starts = list(accumulate(map(len, padded), initial=132 + 12 * len(tags)))  # of the tags, and the end of the file
+    table = b"".join(struct.pack(">4sII", *row) for row in zip(tags, starts, map(len, tags.values())))
+    head = struct.pack(">I", starts[-1]) + b"\0" * 4 + b"\2\x10\0\0mntr" + model + b"XYZ " + b"\0" * 12 + b"acsp"
+    return head + b"\0" * 88 + struct.pack(">I", len(tags)) + table + b"".join(padded)
 
 
 def curv(*values):
@@ -57,7 +57,6 @@ def para(kind, *values):
 
 
 SRGB_PARA = para(3, 2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
-SRGB_TABLE = curv(*codes(srgb_decode(np.linspace(0, 1, 4096)), np.uint16).tolist())
 GAMMA = 563 / 256
 
 
@@ -75,13 +74,9 @@ def iccp(*arguments, **named):
 
 def png(values, **chunks):
     """A PNG of 16 bits with further chunks."""
-    rows = [b"\0" + row.astype(">u2").tobytes() for row in codes(values, np.uint16)]
-    content = b"\x89PNG\r\n\x1a\n"
-    header = {"IHDR": struct.pack(">IIBBBBB", 18, 12, 16, 2, 0, 0, 0)}
-    for name, data in (header | chunks | {"IDAT": zlib.compress(b"".join(rows)), "IEND": b""}).items():
-        part = name.encode() + data
-        content += struct.pack(">I", len(data)) + part + struct.pack(">I", zlib.crc32(part))
-    return "a.png", content
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in codes(values, np.uint16))
+    before = b"".join(sample.chunk(name.encode(), data) for name, data in chunks.items())
+    return "a.png", sample.png(sample.png_header(18, 12, 16, 2), zlib.compress(rows), before=before)
 
 
 def pillow(name, image, **options):
@@ -123,7 +118,11 @@ TRANSFER = tuple(int(v) for v in codes(np.linspace(0, 1, 256) ** GAMMA, np.uint1
 P3_PNG = stored(P3, srgb_encode)
 READ = {  # file, radiance, tolerance
     "ICC, parametric": (png(P3_PNG, iCCP=iccp(P3, SRGB_PARA)), WIDE, 5e-4),
-    "ICC, table": (png(P3_PNG, iCCP=iccp(P3, SRGB_TABLE)), WIDE, 5e-4),
+    "ICC, table": (
+        png(P3_PNG, iCCP=iccp(P3, curv(*codes(srgb_decode(np.linspace(0, 1, 4096)), np.uint16).tolist()))),
+        WIDE,
+        5e-4,
+    ),
     "ICC, identity": (png(stored(P3, np.asarray), iCCP=iccp(P3, curv())), WIDE, 5e-4),
     "ICC, power, before EXIF": (jpeg(stored(ADOBE, adobe), icc_profile=icc(ADOBE, curv(563))), WIDE, 0.03),
     "ICC, its own cicp": (png(P3_PNG, iCCP=iccp(SRGB, curv(), cicp=b"cicp\0\0\0\0\x0c\x0d\0\1")), WIDE, 5e-5),
@@ -175,9 +174,7 @@ REFUSED = {
 
 def write(folder, file):
     """Write a file of the table."""
-    path = folder / file[0]
-    path.write_bytes(file[1])
-    return path
+    return sample.put(folder / file[0], file[1])
 
 
 @pytest.mark.parametrize("case", READ)
@@ -195,12 +192,8 @@ def test_colours_that_are_not_read_are_refused_by_name(tmp_path, fault):
 
 def test_float_codes_have_the_curve_of_their_profile(tmp_path):
     profile = np.frombuffer(icc(P3, para(0, 2.0)), np.uint8)
-    values = stored(P3, np.sqrt).astype(np.float32)
-    spec = oiio.ImageSpec(18, 12, 3, oiio.FLOAT)
-    spec.attribute("ICCProfile", f"uint8[{len(profile)}]", profile)
-    output = oiio.ImageOutput.create(str(tmp_path / "a.tif"))
-    assert output.open(str(tmp_path / "a.tif"), spec) and output.write_image(values) and output.close()
-    assert read_photo(tmp_path / "a.tif").radiance == pytest.approx(WIDE, abs=5e-4)
+    path = save(tmp_path / "a.tif", stored(P3, np.sqrt).astype(np.float32), ICCProfile=profile)
+    assert read_photo(path).radiance == pytest.approx(WIDE, abs=5e-4)
 
 
 def test_a_given_encoding_replaces_the_curve_and_not_the_primaries(tmp_path):
