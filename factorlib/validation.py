@@ -8,7 +8,7 @@ loads stages.  It knows no science, and a run with nothing to do must not import
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ class Validation:
         self.spec = dataset.spec
         self.file = dataset.folder.joinpath
         self._done: set[str] = set()
-        self._parts: dict[str, list[tuple[str, ...]] | InputError] = {}
+        self._parts = cache(read_parts)
         self._pixels: list[Check] = []
 
     def faults(self, requests: Iterable[tuple[str, str | None, dict[str, Any], Path]]) -> list[InputError]:
@@ -161,16 +161,10 @@ class Validation:
         check_materials(labels, objects, object_materials, self.spec.materials, file, f"{key}.objects")
 
     def _object(self, obj: MeshInstance, relative: str, limits: Limits) -> None:
-        """Check the parts of a mesh file, which is read once; a failure is raised again for every object."""
+        """Check the parts of a mesh file, which is read once if it can be."""
         file = self.file(relative)
-        if relative not in self._parts:
-            try:
-                self._parts[relative] = read_parts(file, limits)
-            except InputError as error:
-                self._parts[relative] = error
-        if isinstance(parts := self._parts[relative], InputError):
-            raise parts
-        part_labels(parts, self.spec.materials, self.spec.meshes[obj.mesh].part_materials, obj.materials, file)
+        names = self.spec.meshes[obj.mesh].part_materials
+        part_labels(self._parts(file, limits), self.spec.materials, names, obj.materials, file)
 
 
 def _faults(checks: Iterable[Check]) -> list[InputError]:

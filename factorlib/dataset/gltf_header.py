@@ -19,7 +19,6 @@ from factorlib.reading import MOST_BYTES, check_plain, one_line, reading
 
 Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 Numbers3 = tuple[float, float, float]
-Numbers4 = tuple[float, float, float, float]
 WHAT = "glTF"
 CURE = "the file may be incomplete: export it again, as .glb or .gltf"
 MOST_VALUES = 2_000_000  # values in a header: each becomes an object of some hundred bytes; base64 has no commas
@@ -28,12 +27,6 @@ HARMLESS = re.compile(  # extensions that are read, and those of materials, text
     r"EXT_mesh_gpu_instancing|KHR_(mesh_quantization|animation_pointer|xmp_json_ld)|[A-Z]+_(materials|texture|lights)_\w+"
 )
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
-
-
-class Asset(msgspec.Struct, frozen=True):
-    """Version of glTF that a file has."""
-
-    version: str
 
 
 class Buffer(msgspec.Struct, frozen=True):
@@ -109,7 +102,7 @@ class GltfNode(msgspec.Struct, frozen=True):
     children: list[Count] = []
     matrix: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)] | None = None
     translation: Numbers3 = (0.0, 0.0, 0.0)
-    rotation: Numbers4 = (0.0, 0.0, 0.0, 1.0)
+    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     scale: Numbers3 = (1.0, 1.0, 1.0)
     skin: Count | None = None
     weights: list[float] = []
@@ -125,7 +118,7 @@ class GltfScene(msgspec.Struct, frozen=True):
 class Versioned(msgspec.Struct, frozen=True):
     """The JSON of any version of glTF."""
 
-    asset: Asset
+    asset: dict[str, Any]
 
 
 class GltfHeader(msgspec.Struct, frozen=True):
@@ -193,7 +186,7 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
                 f"its header has more than {MOST_VALUES:,} values",
                 "export the geometry alone, with its data in a .bin file or as .glb",
             )
-        version = msgspec.json.decode(text, type=Versioned).asset.version
+        version = msgspec.json.decode(text, type=Versioned).asset["version"]
         if version.split(".")[0] != "2":
             raise refusal(f"is glTF {one_line(version[:20])}", "export it again, as glTF 2.0")
         header = msgspec.json.decode(text, type=GltfHeader)

@@ -63,16 +63,21 @@ def material_xml(name: str, material: Reflectance) -> str:
 
 
 def _sensor(scene: ExportedScene) -> dict[str, Any]:
-    cx, cy = scene.camera.centre
-    w = scene.camera.width
-    h = scene.camera.height
+    camera = scene.camera
+    cx, cy = camera.centre
     near, far = scene.clip_distances
-    film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb", "component_format": "float32"}
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+    }
     return {
         "type": "perspective",
-        "fov": float(np.degrees(2 * np.arctan(w / (2 * scene.camera.focal)))),
-        "principal_point_offset_x": (w / 2 - cx) / w,
-        "principal_point_offset_y": (h / 2 - cy) / h,
+        "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.focal)))),
+        "principal_point_offset_x": (camera.width / 2 - cx) / camera.width,
+        "principal_point_offset_y": (camera.height / 2 - cy) / camera.height,
         "near_clip": near,
         "far_clip": far,
         "fov_axis": "x",

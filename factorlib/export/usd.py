@@ -115,16 +115,14 @@ def identifiers(names: Iterable[str]) -> dict[str, str]:
 
 def _camera(scene: ExportedScene) -> list[str]:
     camera = scene.camera
-    pixel = FILM / scene.camera.width
+    pixel = FILM / camera.width
     cx, cy = camera.centre
-    w = camera.width
-    h = camera.height
     numbers = {
         "focalLength": camera.focal * pixel,
-        "horizontalAperture": w * pixel,
-        "horizontalApertureOffset": (w / 2 - cx) * pixel,
-        "verticalAperture": h * pixel,
-        "verticalApertureOffset": (cy - h / 2) * pixel,
+        "horizontalAperture": camera.width * pixel,
+        "horizontalApertureOffset": (camera.width / 2 - cx) * pixel,
+        "verticalAperture": camera.height * pixel,
+        "verticalApertureOffset": (cy - camera.height / 2) * pixel,
     }
     lines = [f"float2 clippingRange = {_tuple(scene.clip_distances)}", 'token projection = "perspective"']
     return _prim('Camera "camera"', [*lines, *(f"float {name} = {_number(value)}" for name, value in numbers.items())])

@@ -12,7 +12,7 @@ programs show it.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,17 +33,20 @@ FAILURES = (ValueError, EOFError, SyntaxError, RuntimeError, OSError)  # excepti
 ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}  # EXIF's orientation for LibRaw's `flip`
 AROUND = 5  # side of the square from which demosaicing interpolates a pixel
 WHITE = 2**16 - 1
-TAGS = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity", "Exif:FocalLength")
+TAGS = {  # LibRaw's names, for files other than TIFF
+    "ExposureTime": "shutter_speed",
+    "FNumber": "aperture",
+    "Exif:PhotographicSensitivity": "iso_speed",
+    "Exif:FocalLength": "focal_length",
+}
 
 
 def is_heif(path: str | Path) -> bool:
     """Return whether the file begins with a box `ftyp` of a HEIF brand."""
-    try:
-        with Path(path).open("rb") as stream:
-            head = stream.read(12)
-    except OSError:
-        return False
-    return head[4:8] == b"ftyp" and head[8:12] in BRANDS
+    with suppress(OSError), Path(path).open("rb") as stream:
+        head = stream.read(12)
+        return head[4:8] == b"ftyp" and head[8:12] in BRANDS
+    return False
 
 
 def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
@@ -114,12 +117,6 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
         sizes = sensor.sizes
         settings = sensor.other
     rows, columns = _crop(sizes)
-    camera = (
-        settings.shutter_speed,
-        settings.aperture,
-        settings.iso_speed,
-        settings.focal_length,
-    )  # for files other than TIFF
 
     @cache
     def develop() -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +142,7 @@ def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
         width=columns.stop - columns.start,
         height=rows.stop - rows.start,
         orientation=ORIENTATION.get(sizes.flip, 1),
-        exif={**dict(zip(TAGS, camera)), **read_exif(path)},
+        exif={tag: getattr(settings, name) for tag, name in TAGS.items()} | read_exif(path),
         white=WHITE,
         space=LINEAR,
         rows=lambda begin, end: develop()[0][begin:end],

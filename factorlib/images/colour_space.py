@@ -40,8 +40,7 @@ LARGEST_GAIN = 100.0  # greatest factor between primaries; damaged ones have mor
 EXPORT = "export it again as sRGB, of 8 or 16 bits, or as a linear EXR"
 CURVES = {"RGB": (b"rTRC", b"gTRC", b"bTRC"), "GRAY": (b"kTRC",) * 3}  # tags of an ICC profile, by its colours
 COLORANTS = {"RGB": (b"rXYZ", b"gXYZ", b"bXYZ"), "GRAY": ()}
-EXIF_SRGB = 1  # values of EXIF's ColorSpace
-EXIF_ADOBE_RGB = 2  # not in the standard, but written by some programs
+EXIF_SRGB = 1  # value of EXIF's ColorSpace
 Image.MAX_IMAGE_PIXELS = None  # of a photo or mask, whose size `check_pixels` limits
 log = logging.getLogger("factorlib.images")
 
@@ -50,7 +49,7 @@ def rec709_decode(code: Values) -> Values:
     """Convert values of the camera curve of BT.709 to linear ones.
 
     >>> rec709_decode(np.array([0.0, 0.081, 0.5, 1.0])).round(4).tolist()
-    [0.0, 0.018, 0.2598, 1.0]
+    [0.0, 0.0179, 0.2596, 1.0]
     """
     size = np.abs(code)
     return np.copysign(np.where(size < 0.081, size / 4.5, ((size + 0.099) / 1.099) ** (1 / 0.45)), code)
@@ -101,10 +100,8 @@ class ColourSpace(msgspec.Struct, frozen=True):
             white: Code of 1; None for floats.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            if white is None:
-                values = self._decode(codes.astype(np.float32)).astype(np.float32)
-            elif white >= 2**16:
-                values = self._decode(codes / white).astype(np.float32)
+            if white is None or white >= 2**16:
+                values = self._decode(codes.astype(np.float32) if white is None else codes / white).astype(np.float32)
             else:
                 levels = np.repeat(np.arange(white + 1)[:, None] / white, 3, axis=1)
                 values = self._decode(levels).astype(np.float32)[codes, np.arange(3)]
@@ -155,7 +152,7 @@ def colour_space(
             return _tiff_space(exif, default)
         named = exif.get_ifd(IFD.Exif).get(Base.ColorSpace, EXIF_SRGB)
         index = str(exif.get_ifd(IFD.Interop).get(Interop.InteropIndex, ""))
-        if index.startswith("R03") or named == EXIF_ADOBE_RGB:
+        if index.startswith("R03") or named == 2:  # which some programs write, though the standard has no 2
             return ColourSpace((power_decode(563 / 256),) * 3, to_rec709(ADOBE_RGB))
         if named != EXIF_SRGB:
             log.warning("%s: EXIF says that it is not sRGB, and no profile says what it is: taken for sRGB", path)

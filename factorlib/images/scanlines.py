@@ -33,13 +33,9 @@ from factorlib.reading import one_line, reading
 
 CLIPPED = 0.995  # least share of the white code that is clipped: JPEG compression disturbs the top code a little
 WHITE = {oiio.UINT8: 2**8 - 1, oiio.UINT16: 2**16 - 1, oiio.UINT32: 2**32 - 1}
-FLOATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-READ_COLOURS = ("", "RGB", "YCbCr", "palette")  # colours of TIFF and JPEG that are converted to RGB exactly
 BEAUTY = ("beauty", "rgba", "rgb", "combined", "main")  # names that renderers give to the layer that is the picture
 SAME_ASPECT = 0.01  # tolerance of a pixel's width over its height
-HEADER = 4096  # number of bytes that hold the header of a Radiance file
 COPY = "copy it again from its source"
-OLD_RUNS = "; if it has the run lengths of Radiance before 1991, convert it: ra_xyze -r in.hdr out.hdr"
 log = logging.getLogger("factorlib.images")
 MOST_MEGAPIXELS = 200.0  # twice the number of the largest sensors
 CHANNELS = 4  # greatest number of channels of an ordinary photo
@@ -112,7 +108,7 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     with Path(path).open("rb") as stream:
-        head = stream.read(HEADER)
+        head = stream.read(4096)  # the header, if it is a Radiance file
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
         fault = f"not readable as an image ({one_line(oiio.geterror())})"
@@ -154,7 +150,6 @@ def _stored_rows(
     """Return the reader of rows as stored; from a tiled file, the rows of tiles that contain them are read."""
     first = min(colours)
     last = max(colours) + 1
-    picked = [c - min(colours) for c in colours]
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
         """Read rows begin … end − 1."""
@@ -168,11 +163,12 @@ def _stored_rows(
             pixels = source.read_scanlines(spec.y + begin, spec.y + end, 0, first, last, spec.format)
         error = source.geterror()
         if pixels is None or "Premature end" in error:
-            cure = COPY + OLD_RUNS if source.format_name() == "hdr" else COPY
+            old_runs = "; if it has the run lengths of Radiance before 1991, convert it: ra_xyze -r in.hdr out.hdr"
+            cure = COPY + old_runs * (source.format_name() == "hdr")
             raise InputError(f"truncated or damaged ({one_line(error)})", file=path, key=key, cure=cure)
         if error:
             log.warning("%s: %s", path, one_line(error))
-        return pixels.reshape(-1, spec.width, last - first)[begin - top : end - top, :, picked]
+        return pixels.reshape(-1, spec.width, last - first)[begin - top : end - top, :, np.subtract(colours, first)]
 
     return rows
 
@@ -234,13 +230,13 @@ def _layers(spec: oiio.ImageSpec) -> dict[str, list[int]]:
 
 def _check_kind(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> None:
     """Check that codes and pixels are of a kind that is read; InputError names another one."""
-    kind = spec.format.basetype
     colours = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
     aspect = spec.get_float_attribute("PixelAspectRatio", 1.0)
     faults = {
         "it has deep samples": spec.deep,
-        f"its codes are of type {spec.format}": kind not in WHITE and kind not in FLOATS,
-        f"its colours are {colours}": colours not in READ_COLOURS,
+        f"its codes are of type {spec.format}": spec.format.basetype
+        not in (*WHITE, oiio.HALF, oiio.FLOAT, oiio.DOUBLE),
+        f"its colours are {colours}": colours not in ("", "RGB", "YCbCr", "palette"),  # converted to RGB exactly
         f"its pixels are not square, but of aspect {aspect:.3g}": abs(aspect - 1) > SAME_ASPECT,
     }
     if fault := next((fault for fault, is_true in faults.items() if is_true), None):

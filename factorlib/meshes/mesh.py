@@ -99,15 +99,12 @@ def closed_grid(points: Float[np.ndarray, "r c 3"], top: np.ndarray, bottom: np.
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     right = np.roll(index, -1, axis=1)
-    a = index[:-1]
-    b = right[:-1]
-    c = index[1:]
-    d = right[1:]
     last = rows * columns
     cap = np.stack([right[0], np.full(columns, last), index[0]], axis=-1)
     base = np.stack([index[-1], np.full(columns, last + 1), right[-1]], axis=-1)
-    sides = np.concatenate([np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)]).reshape(-1, 3)
-    return smooth(np.concatenate([points.reshape(-1, 3), [top, bottom]]), np.concatenate([sides, cap, base]))
+    lower = np.stack([index[:-1], index[1:], right[1:]], axis=-1).reshape(-1, 3)
+    upper = np.stack([index[:-1], right[1:], right[:-1]], axis=-1).reshape(-1, 3)
+    return smooth(np.concatenate([points.reshape(-1, 3), [top, bottom]]), np.concatenate([lower, upper, cap, base]))
 
 
 def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndarray | int = 1) -> Mesh:

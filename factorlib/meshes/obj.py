@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from factorlib.errors import InputError
-from factorlib.meshes.triangle_soup import Limits, TriangleSoup, quoted, text_lines, triangulate
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, normals_at_corners, quoted, text_lines, triangulate
 
 MOST = 2**31  # greatest index in any file
 COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles
@@ -64,15 +64,14 @@ class _Tables:
 
     def soup(self) -> TriangleSoup:
         """Return the triangles of the whole file."""
-        normals = np.concatenate([np.array(self.coordinates["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
-        index = np.array(self.corner_normals, dtype=np.int64)
-        index[(index < 0) | (index >= len(normals))] = len(normals) - 1
+        normals = np.array(self.coordinates["vn"]).reshape(-1, 3)
         vertices = np.array(self.coordinates["v"], dtype=float).reshape(-1, 3)
         corners = np.array(self.corners, dtype=np.int64)
         sizes = np.array(self.sizes, dtype=np.int64)
         triangles = triangulate(vertices, sizes, corners)
         part = np.repeat(np.array(self.part, dtype=np.int64), sizes - 2)
-        return TriangleSoup(vertices, corners[triangles], part, list(self.parts), normals[index[triangles]])
+        corner_normals = normals_at_corners(normals, np.array(self.corner_normals, dtype=np.int64)[triangles])
+        return TriangleSoup(vertices, corners[triangles], part, list(self.parts), corner_normals)
 
 
 def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:

@@ -79,11 +79,12 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
         values = np.append(values, strips)
         sizes = np.append(sizes, np.full(len(strips), 3))
     numbers = {name: floats(column) for name, (column, each) in columns.get("vertex", {}).items() if (each == 1).all()}
-    if not {"x", "y", "z"} <= numbers.keys():
+    points, normals = (
+        np.stack([numbers[name] for name in names], axis=1) if numbers.keys() >= {*names} else np.empty((0, 3))
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"))
+    )
+    if not numbers.keys() >= {"x", "y", "z"}:
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
-    points = np.stack([numbers[n] for n in "xyz"], axis=1)
-    normal_names = "nx", "ny", "nz"
-    normals = np.stack([numbers[n] for n in normal_names], axis=1) if set(normal_names) <= numbers.keys() else None
     return _polygon_soup(points, values, sizes, path, limits, normals)
 
 
@@ -99,7 +100,7 @@ def _polygon_soup(
     sizes: np.ndarray,
     path: Path,
     limits: Limits,
-    normals: np.ndarray | None = None,
+    normals: np.ndarray = np.empty((0, 3)),
 ) -> TriangleSoup:
     """Return the triangles of polygons with vertex indices `values`, all in a row; InputError for a bad index."""
     limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
@@ -289,9 +290,12 @@ def read_stl(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
         corners = parse_numbers(b" ".join(VERTEX.findall(content)))
         facets = len(END_FACET.findall(content))
         if not 0 < len(corners) == 9 * facets:
-            fault = f"is neither a whole text STL ({len(corners) // 3} corners of {facets} facets) "
-            fault += f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
-            raise InputError(fault, file=path, cure=CURE)
+            raise InputError(
+                f"is neither a whole text STL ({len(corners) // 3} corners of {facets} facets) "
+                f"nor a whole binary STL ({len(content)} of {binary_size} bytes)",
+                file=path,
+                cure=CURE,
+            )
     limits.check(corners.size // 3, corners.size // 9, path)
     return single_part_soup(corners, np.arange(corners.size // 3), path.stem)
 

@@ -99,7 +99,7 @@ def floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
 
 
 def single_part_soup(
-    vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None
+    vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray = np.empty((0, 3))
 ) -> TriangleSoup:
     """Build a soup whose faces are all one part.
 
@@ -107,21 +107,19 @@ def single_part_soup(
         vertices: Vertices, [V, 3].
         faces: Triangles, [F, 3].
         name: Name of the part.
-        normals: Normals by vertex, [V, 3].
+        normals: Normals by vertex, [V, 3], or none.
 
     Returns:
         The soup.
     """
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
-    corner_normals = no_normals(len(faces)) if normals is None else normals_at_corners(normals, faces)
     return TriangleSoup(
-        floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], corner_normals
+        vertices=floats(vertices).reshape(-1, 3),
+        faces=faces,
+        part=np.zeros(len(faces), np.int64),
+        parts=[(name,)],
+        normals=normals_at_corners(normals, faces),
     )
-
-
-def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
-    """Return the corner normals of a file without normals: NaN."""
-    return np.full((faces, 3, 3), np.nan)
 
 
 def normals_at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:

@@ -283,34 +283,29 @@ def begin(
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     with ended_by_signals(folder):
-        return _begin(project, dataset, folder, photos, meshes, masks)
-
-
-def _begin(
-    project: Project, dataset: str, folder: Path, photos: Path, meshes: Path | None, masks: Path | MatteFile | None
-) -> int:
-    """Create a dataset in a folder, as `begin` does."""
-    notes = []
-    if isinstance(masks, MatteFile):
-        with _shown("photos") as progress:  # modules by name: they are science
-            create = import_module("factorlib.onboarding.from_photos").dataset_from_photos
-            missing, notes = create(folder, photos, meshes, masks.path, lambda share, text: progress(share, 1, text))
-    else:
-        missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
-    ending = "; still missing, or yours to decide:" if missing else ""
-    print(f"{project.short_path(folder)}/dataset.yaml is written{ending}")
-    for line in (*missing, *notes):
-        print(f"  {line}")
-    try:
-        _draw_sheet(project, folder)
-    except InputError as fault:
-        print(f"  no contact sheet: {fault}")
-    if isinstance(masks, MatteFile) and not missing:
-        return validate(project, dataset, [])
-    drawn = f"name your materials in it, then {project.command('label', dataset)}, then "
-    first = drawn if any("make label" in line for line in missing) else ""
-    print(f"next: {first}{project.command('validate', dataset)}")
-    return 0
+        notes = []
+        if isinstance(masks, MatteFile):
+            with _shown("photos") as progress:  # modules by name: they are science
+                create = import_module("factorlib.onboarding.from_photos").dataset_from_photos
+                missing, notes = create(
+                    folder, photos, meshes, masks.path, lambda share, text: progress(share, 1, text)
+                )
+        else:
+            missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
+        ending = "; still missing, or yours to decide:" if missing else ""
+        print(f"{project.short_path(folder)}/dataset.yaml is written{ending}")
+        for line in (*missing, *notes):
+            print(f"  {line}")
+        try:
+            _draw_sheet(project, folder)
+        except InputError as fault:
+            print(f"  no contact sheet: {fault}")
+        if isinstance(masks, MatteFile) and not missing:
+            return validate(project, dataset, [])
+        drawn = f"name your materials in it, then {project.command('label', dataset)}, then "
+        first = drawn if any("make label" in line for line in missing) else ""
+        print(f"next: {first}{project.command('validate', dataset)}")
+        return 0
 
 
 @contextlib.contextmanager
@@ -326,9 +321,9 @@ def ended_by_signals(target: Path) -> Iterator[None]:
         """Wait for a signal."""
         number = signal.sigwait(numbers)
         print("stopped", file=sys.stderr, flush=True)
-        drafts = map(str, target.parent.glob(f".{target.name}.*"))
         remove = 'code=$1; shift; rm -rf -- "$@"; exit "$code"'
-        os.execvp("sh", ["sh", "-c", remove, "sh", str(128 + number), root, *drafts])
+        drafts = target.parent.glob(f".{target.name}.*")
+        os.execvp("sh", ["sh", "-c", remove, "sh", str(128 + number), root, *map(str, drafts)])
 
     with tempfile.TemporaryDirectory() as root:
         tempfile.tempdir = root

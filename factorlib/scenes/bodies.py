@@ -23,7 +23,7 @@ from factorlib.generate.solids import BUMPS, revolve
 from factorlib.geometry import open3d as o3d
 from factorlib.meshes.mesh import Mesh, closed_grid
 from factorlib.meshes.read_mesh import CREASE_DEG, usable
-from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
+from factorlib.meshes.triangle_soup import TriangleSoup
 
 Part = tuple[np.ndarray, np.ndarray, int]  # vertices [V, 3], faces [F, 3], label
 
@@ -180,5 +180,7 @@ def mesh_from_parts(parts: list[Part], name: str) -> Mesh:
     first = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts])
     faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, first)]).astype(np.int64)
     label = np.repeat([label for _, _, label in parts], [len(faces) for _, faces, _ in parts])
-    soup = TriangleSoup(np.concatenate([v for v, _, _ in parts]), faces, label * 0, [("all",)], no_normals(len(faces)))
+    soup = TriangleSoup(
+        np.concatenate([v for v, _, _ in parts]), faces, label * 0, [("all",)], np.full((len(faces), 3, 3), np.nan)
+    )
     return usable(soup, label, CREASE_DEG, name)

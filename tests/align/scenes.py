@@ -11,7 +11,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import usable
-from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
+from factorlib.meshes.triangle_soup import TriangleSoup
 
 
 def mesh_of(parts: list, labels: list[int] | None = None, crease_deg: float = 40.0) -> Mesh:
@@ -20,7 +20,11 @@ def mesh_of(parts: list, labels: list[int] | None = None, crease_deg: float = 40
     whole = trimesh.util.concatenate(parts)
     label = np.repeat(labels, [len(p.faces) for p in parts])
     soup = TriangleSoup(
-        np.array(whole.vertices), np.array(whole.faces), label * 0, [("all",)], no_normals(len(whole.faces))
+        np.array(whole.vertices),
+        np.array(whole.faces),
+        label * 0,
+        [("all",)],
+        np.full((len(whole.faces), 3, 3), np.nan),
     )
     return usable(soup, label, crease_deg, "test")
 

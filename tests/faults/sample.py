@@ -49,15 +49,17 @@ VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 ROWS = "".join("{} {} {}\n".format(*v) for v in VERTICES)
 TRIANGLES = "".join("3 {} {} {}\n".format(*f) for f in FACES)
-OBJ = "mtllib a.mtl\no chair\ng shell\nusemtl red\n"
-OBJ += "".join(f"v {row}\n" for row in ROWS.splitlines()) + "vn 0 0 1\n"
-OBJ += "".join("f {} {}//1 {}\n".format(*(f + 1)) for f in FACES)
+OBJ = "mtllib a.mtl\no chair\ng shell\nusemtl red\n{}vn 0 0 1\n{}".format(
+    "".join(f"v {row}\n" for row in ROWS.splitlines()),
+    "".join("f {} {}//1 {}\n".format(*(f + 1)) for f in FACES),
+)
 OFF = f"OFF\n4 4 0\n{ROWS}{TRIANGLES}"
 FACET = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
 CORNERS = ["".join("vertex {} {} {}\n".format(*VERTICES[v]) for v in face) for face in FACES]
 STL_TEXT = f"solid chair\n{''.join(FACET.format(corners) for corners in CORNERS)}endsolid chair\n"
-STL_ROWS = (struct.pack("<12fH", 0, 0, 0, *VERTICES[face].ravel(), 0) for face in FACES)
-STL = b"a" * 80 + struct.pack("<I", 4) + b"".join(STL_ROWS)
+STL = struct.pack("<80sI", b"a" * 80, 4) + b"".join(
+    struct.pack("<12fH", 0, 0, 0, *VERTICES[face].ravel(), 0) for face in FACES
+)
 PLY_HEADER = """ply
 format {} 1.0
 comment TextureFile a.png
@@ -179,12 +181,15 @@ CAMERAS_TXT = b"# cameras\n1 SIMPLE_PINHOLE 200 150 300 104 71\n"
 IMAGES_TXT = b"# images\n1 .7 .1 -.5 .5 1 2 3 1 7.png\n1 2 3\n"
 LENS = {"fl_x": 300.0, "fl_y": 300.0, "cx": 104.0, "cy": 71.0, "w": 200, "h": 150, "k1": 0.0, "camera_model": "OPENCV"}
 MATRIX = [[*row, 5.0] for row in EYE]
-OTHER_FRAME = {"file_path": "./8", "camera_angle_x": 0.7, "is_fisheye": False, "k2": 1e-5, "transform_matrix": MATRIX}
-TRANSFORMS = {**LENS, "frames": [{"file_path": "7.png", "transform_matrix": [*MATRIX, [0, 0, 0, 1]]}, OTHER_FRAME]}
+TRANSFORMS = {
+    **LENS,
+    "frames": [
+        {"file_path": "7.png", "transform_matrix": [*MATRIX, [0, 0, 0, 1]]},
+        {"file_path": "./8", "camera_angle_x": 0.7, "is_fisheye": False, "k2": 1e-5, "transform_matrix": MATRIX},
+    ],
+}
 CAM_K = [300.0, 0.0, 103.5, 0.0, 300.0, 70.5, 0.0, 0.0, 1.0]
-SCENE_CAMERA = {str(k): {"cam_K": CAM_K, "depth_scale": 1.0} for k in (7, 8)}
 GT = {"obj_id": 5, "cam_R_m2c": NINE, "cam_t_m2c": [0.0, 0.0, 1500.0]}
-SCENE_GT = {str(k): [GT] for k in (7, 8)}
 SOURCES = {
     "bop": {"bop": "model", "images": {"hall": 7}, "obj_ids": {"vase": 5}, "mesh_unit_mm": 1000.0},
     "transforms": {"transforms": "t.json", "images": {"hall": "7.png"}, "world_from_camera": True},
@@ -228,19 +233,35 @@ TRUTH = {
     "albedo": {"room": "albedo.exr"},
     "poses": {"hall": {"vase": PLACE}},
 }
-STDERR = {"diffuse": [0.1, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.1}
 SOLUTION = {
-    "materials": {"red": {**TRUTH["materials"]["red"], "alpha": 0.09, "stderr": STDERR}},
+    "materials": {
+        "red": {
+            **TRUTH["materials"]["red"],
+            "alpha": 0.09,
+            "stderr": {"diffuse": [0.1] * 3, "specular": [0.1] * 3, "roughness": 0.1},
+        }
+    },
     "gauge": {"component": {"red": 0}},
     "model": {"specular": {"red": True}, "self_shadowing": True, "tone": {"hall": {"exponent": 1.0, "pivot": 0.5}}},
 }
-CAMERA = {"focal_px": 300.0, "principal_point": [8.0, 6.0], "focal_source": "exif", "focal_relative_stderr": 0.1}
-PLACED = {"rotation": EYE, "translation": [0.0, 0.0, 2.0], "scale": [1.0, 1.0, 1.0], "runner_up": None}
-POSES = {"hall": {"camera": CAMERA, "objects": {"vase": PLACED}}}
+POSES = {
+    "hall": {
+        "camera": {
+            "focal_px": 300.0,
+            "principal_point": [8.0, 6.0],
+            "focal_source": "exif",
+            "focal_relative_stderr": 0.1,
+        },
+        "objects": {
+            "vase": {"rotation": EYE, "translation": [0.0, 0.0, 2.0], "scale": [1.0, 1.0, 1.0], "runner_up": None}
+        },
+    }
+}
 PLAIN = {  # name -> what is written as JSON or YAML
     "labelme.json": {"shapes": [{"label": "red", "points": [[1, 1], [6, 6]], "shape_type": "rectangle"}], "imageHeight": H},
-    "truth.yaml": TRUTH, "coco.json": COCO, "t.json": TRANSFORMS, "model/scene_camera.json": SCENE_CAMERA,
-    "model/scene_gt.json": SCENE_GT,
+    "truth.yaml": TRUTH, "coco.json": COCO, "t.json": TRANSFORMS,
+    "model/scene_camera.json": {str(k): {"cam_K": CAM_K, "depth_scale": 1.0} for k in (7, 8)},
+    "model/scene_gt.json": {str(k): [GT] for k in (7, 8)},
     "solve/materials.json": SOLUTION, "solve/exposures.json": {"hall": [1.0, 1.0, 1.0]}, "poses.json": POSES,
 }  # fmt: skip
 CONTENT = {
@@ -258,9 +279,11 @@ def observations(n: int = 5) -> Observations:
     unit = np.random.default_rng(0).normal(size=(2, n, 3))
     normal, view = unit / np.linalg.norm(unit, axis=2, keepdims=True)
     zero, radiance, visibility = np.zeros(n, int), np.random.default_rng(1).random((n, 3)), np.full((n, 8), 255, "u1")
-    names = ("red",), ("hall",), ("hall",)
     unclipped = np.zeros((n, 3), bool)
-    return Observations(normal, view, radiance, unclipped, zero, zero, zero, zero, zero, np.ones(n), *names, visibility)
+    return Observations(
+        *(normal, view, radiance, unclipped, zero, zero, zero, zero, zero, np.ones(n)),
+        *(("red",), ("hall",), ("hall",), visibility),
+    )
 
 
 def make_set(folder: Path) -> Path:
@@ -290,8 +313,7 @@ def changed(folder: Path, name: str, content: object) -> Iterator[Path]:
     if callable(content):
         content(path)
     else:
-        plain = content if isinstance(content, (bytes, str)) else json.dumps(content)
-        put(path, plain)
+        put(path, content if isinstance(content, (bytes, str)) else json.dumps(content))
     try:
         yield path
     finally:
@@ -341,12 +363,10 @@ def with_cameras(source: str, **more: str):
 
 def run_masks(folder: Path, name: str) -> None:
     """The stage `masks` of a photo, whose image, mask or mask of an object is the file."""
-    photo = {"image": "7.png", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "a"}
-    photo = msgspec.to_builtins(
-        PhotoSlice(**photo | ({} if name in ("7.png", "mask.png") else {"image": name}), objects=[])
-    )
+    image = "7.png" if name == "mask.png" else name
+    photo = PhotoSlice(image=image, encoding=None, masks="mask.png", focal_px=None, illumination="a", objects=[])
     files = {path.name: path for path in folder.iterdir() if path.is_file()}
-    facts = {"dataset.photo": photo, "dataset.materials": DATASET["materials"]}
+    facts = {"dataset.photo": msgspec.to_builtins(photo), "dataset.materials": DATASET["materials"]}
     (folder / "out").mkdir(exist_ok=True)
     masks.main(masks.Params(), Inputs({}, facts, files, "hall"), folder / "out")
 

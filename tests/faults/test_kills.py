@@ -243,12 +243,11 @@ def test_make_photos_ends_at_a_signal_inside_native_code_and_removes_what_it_beg
 # ── two runs, inputs, clocks, places ─────────────────────────────────────────────────────────────────────────────────
 
 
-SPOIL = "p = {0} / 'a.json'; p.chmod(0o644); p.write_text('{{{{\"letters\": 100}}}}')"
 READ = "changed while it was being read"
 MEANWHILE = {  # what changes while a step runs -> that stage, the line before which it does, how, and words of the error
     "a photo goes": ("upper", "    text =", "Path({root!r}, 'data/set/a.txt').unlink(True)", ("a.txt", READ)),
     "a result goes": ("total", "    counts =", "__import__('shutil').rmtree(inputs['table'])", ("table", READ)),
-    "a result is spoilt": ("total", "    counts =", SPOIL.format("inputs['count']"), ("a.json", READ)),
+    "a result is spoilt": ("total", "    counts =", "p = inputs['count'] / 'a.json'; p.chmod(0o644); p.write_text('{{\"letters\": 100}}')", ("a.json", READ)),
     "the code is another": ("table", "    (out /", "f = Path(__file__); f.write_text(f.read_text() + 'NEW = 1\\n')",
                             ("stages/table.py", "changed while", "run again")),
     "the code is half typed": ("table", "    (out /", "Path(__file__).write_text('def (')", ("stages/table.py",)),
@@ -278,12 +277,10 @@ def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made
     assert make(fresh) == 0 and is_sound(fresh) and results(fresh) == results(made_once)
 
 
-GONE = (".", "set", *(f"store/{name}" for name in ("trees", "keys", "views", "cache")))
-
-
 def test_a_folder_of_results_that_is_deleted_is_made_again(project):
     wanted = results(project)
-    for deleted in (deleted for deleted in GONE if (project.build / deleted).exists()):
+    folders = (".", "set", "store/trees", "store/keys", "store/views", "store/cache")
+    for deleted in (deleted for deleted in folders if (project.build / deleted).exists()):
         shutil.rmtree(project.build / deleted)
         assert make(project) == 0 and is_sound(project) and results(project) == wanted, deleted
 
@@ -328,10 +325,6 @@ def overwrite(path, text="OTHER", keep_times=False):
         os.utime(path, ns=times)
 
 
-def link_elsewhere(path):
-    path.symlink_to(shutil.move(path, path.parent.parent / "elsewhere"))
-
-
 def in_store(project, stage, file):
     """The file of a stage's result where it lies in the store's trees."""
     outputs = (e["output"] for e in entries(project).values() if e["record"]["stage"] == stage and file in e["files"])
@@ -340,7 +333,7 @@ def in_store(project, stage, file):
 
 DAMAGES = {
     "other content": overwrite, "one too many": lambda path: write(path.with_name("more.txt"), "1"),
-    "a link": link_elsewhere, "all gone": lambda path: shutil.rmtree(path.parent),
+    "a link": lambda path: path.symlink_to(shutil.move(path, path.parent.parent / "elsewhere")), "all gone": lambda path: shutil.rmtree(path.parent),
 }  # fmt: skip
 
 
@@ -371,7 +364,6 @@ def test_damage_under_the_same_size_and_time_is_found_by_verify_or_replaced_by_f
 # ── no room ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 SIZE = 100_000  # bytes that a heavy stage writes beside its result
-HEAVY = f"(out / f'large-{{inputs.photo}}.bin').write_bytes(bytes({SIZE}))"
 
 
 def limited():
@@ -381,7 +373,7 @@ def limited():
 def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, again):
     """Without root's rights, which pass limits."""
     project, stage = again(fresh), "table"
-    doing(project, stage, HEAVY)
+    doing(project, stage, f"(out / f'large-{{inputs.photo}}.bin').write_bytes(bytes({SIZE}))")
     usual = again(project)
     assert make(usual) == 0 and make(project, targets=["count"]) == 0
     before = set(stored(project).values())

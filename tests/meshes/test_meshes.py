@@ -12,7 +12,7 @@ from factorlib.meshes.mesh import Mesh, area_vectors, corner_normals, find_flipp
 from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read_mesh import merged_normals, read_mesh, usable
 from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
-from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals, triangulate
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, triangulate
 from tests.faults import sample
 from tests.faults.sample import MESHES, OFF, STL_TEXT, glb, put
 from tests.refusal import refusal
@@ -255,9 +255,9 @@ def test_names_of_obj_keep_their_hash_and_a_comment_is_still_one(tmp_path):
 # ── Smooth normals: exact on a sphere, sharp at creases, indifferent to duplicates, winding and tessellation ────────
 
 
-def usable_mesh(vertices, faces, normals=None, crease_deg=60.0):
+def usable_mesh(vertices, faces, crease_deg=60.0):
     faces = np.asarray(faces)
-    supplied = no_normals(len(faces)) if normals is None else normals
+    supplied = np.full((len(faces), 3, 3), np.nan)
     soup = TriangleSoup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied)
     return usable(soup, np.ones(len(faces), int), crease_deg, "m")
 
