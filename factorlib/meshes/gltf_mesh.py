@@ -166,11 +166,9 @@ def _world_from_nodes(header: GltfHeader) -> dict[int, Float[np.ndarray, "4 4"]]
 def _transforms(
     translation: Float[np.ndarray, "n 3"], rotation: Float[np.ndarray, "n 4"], scale: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return the transforms that scale, then rotate (quaternions x y z w), then translate."""
+    """Return the transforms that scale, then rotate (quaternions x y z w), then translate; ValueError for 0 0 0 0."""
     from scipy.spatial.transform import Rotation
 
-    if not rotation.any(axis=1).all():
-        raise ValueError("the rotation of a node or an instance is the quaternion 0 0 0 0")
     transforms = np.tile(np.eye(4), (len(rotation), 1, 1))
     transforms[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None]
     transforms[:, :3, 3] = translation

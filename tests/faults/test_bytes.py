@@ -179,12 +179,6 @@ def nameless_lobes(path):
     pq.write_table(pq.read_table(path).replace_schema_metadata(metadata), path)
 
 
-def light_of(value):
-    light = np.ones((4, 8, 3), np.float32)
-    light[1, 2, 0] = value
-    return lambda path: write_rgb_exr(path, light)
-
-
 def channels(size=(H, W), **values):
     return lambda path: write_exr(path, {name: np.full(size, v, np.float32) for name, v in values.items()})
 
@@ -194,11 +188,8 @@ def widened(width: int, height: int, **values):
 
     def write(path):
         channels(**(values or dict.fromkeys("RGB", 1)))(path)
-        content = path.read_bytes()
-        for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
-            at = content.index(name) + len(name) + 4
-            content = content[:at] + struct.pack("<4i", 0, 0, width - 1, height - 1) + content[at + 16 :]
-        path.write_bytes(content.ljust(50_000_000, b"\0"))
+        windows = (struct.pack("<4i", 0, 0, right - 1, down - 1) for right, down in ((W, H), (width, height)))
+        path.write_bytes(path.read_bytes().replace(*windows).ljust(50_000_000, b"\0"))
 
     return write
 
@@ -379,7 +370,7 @@ REFUSED = {
     ("bop", "model/scene_gt.json"): [
         *(({"7": [sample.GT | {key: value}]}, key) for key, value in (("cam_t_m2c", [0, 0, 1e300]), ("obj_id", "5"))), {"7": sample.GT},
     ],
-    ("true light", "light.exr"): [(light_of(value), "hall") for value in (np.nan, np.inf, -7.0, -0.1)],
+    ("true light", "light.exr"): [(channels((4, 8), R=[value] + 7 * [1], G=1, B=1), "hall") for value in (np.nan, np.inf, -7.0, -0.1)],
     ("true normals", "n.exr"): [
         (channels(R=0, G=0), "has no channel B"), (channels(**{"normal.x": 0, "normal.y": 0}),
         "has no channel normal.z"),
@@ -506,7 +497,7 @@ READ = [  # what is odd and legal: reader, file, what is in it
     ("mask", "coco.json", {**json.loads(coco([[2, 2, 8, 2, 8, 8]])),
      "more": {"image_id": 8, "category_id": 1, "segmentation": {"size": [1, 1], "counts": "o" * 1000}}}),
     ("transforms", "t.json", transforms(stamp=1.7e18, note=[[[]]])),
-    ("true light", "light.exr", light_of(-1e-4)),  # what resampling leaves
+    ("true light", "light.exr", channels((4, 8), R=[-1e-4] + 7 * [1], G=1, B=1)),  # what resampling leaves
     ("true normals", "n.exr", channels(**{f"normal.{axis}": np.nan for axis in "xyz"})),
     ("true albedo", "n.exr", channels(R=np.nan, G=0, B=1)),
     ("masks", "7.png", sample.PHOTO), ("true maps", "light.exr", lambda path: None),

@@ -133,20 +133,26 @@ def a_glb(*arrays, primitive=(), mesh=(), node=(), accessor=(), view=(), **heade
     ]  # fmt: skip
     views = [{"buffer": 0, "byteOffset": 99 * k, "byteLength": 99} for k in range(len(arrays))]
     data = b"".join(each.tobytes().ljust(99, b"\0") for each in arrays)
-    parts = {"buffers": [{"byteLength": len(data)}], "nodes": [{"mesh": 0} | dict(node)], "asset": {"version": "2.0"}}
-    parts |= {
-        "accessors": [accessors[0] | dict(accessor), *accessors[1:]],
+    parts = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": len(data)}],
         "bufferViews": [views[0] | dict(view), *views[1:]],
+        "accessors": [accessors[0] | dict(accessor), *accessors[1:]],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}} | dict(primitive)]} | dict(mesh)],
+        "nodes": [{"mesh": 0} | dict(node)],
     }
-    parts |= {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}} | dict(primitive)]} | dict(mesh)]}
     return glb(parts | header, data)
 
 
 def ply_of(rows: str, *elements: str) -> str:
     """A PLY of SQUARE, and of further elements, whose rows are lists."""
-    head = sample.PLY_HEADER.format("ascii").split("element face")[0]
-    head += "".join(f"element {each}\nproperty list int int vertex_indices\n" for each in elements)
-    return head + "end_header\n0 0 0\n1 0 0\n0 1 0\n1 1 0\n" + rows
+    lists = "".join(f"element {each}\nproperty list int int vertex_indices\n" for each in elements)
+    return (
+        sample.PLY_HEADER.format("ascii").split("element face")[0]
+        + lists
+        + "end_header\n0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
+        + rows
+    )
 
 
 MOVES = np.array([(5, 0, 0), (0, 5, 0)], "<f4")
@@ -155,15 +161,13 @@ SIZES = np.array([(1, 1, 1), (-2, 1, 1)], "<f4")  # the second is a mirror image
 PLACES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1, "ROTATION": 2, "SCALE": 3}}}
 POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
 UNREAD = ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression", "MSFT_lod", "ACME_shape"]
-SPARSE = {"count": 1, "indices": {"bufferView": 0, "componentType": 5121}, "values": {"bufferView": 0}}
-QUADS_OF_SHORTS = np.pad((CORNER * 32767).astype("<i2"), ((0, 0), (0, 3)))
 # what, its format and content -> triangles, as corners of SQUARE or as points, or a regular expression of the refusal
 MEANING = [
     *((f"{name}.glb", a_glb(CORNER, extensionsRequired=[name]), f"requires {name}.*again without {name}") for name in UNREAD),
     ("paint.glb", a_glb(CORNER, extensionsRequired=["KHR_materials_ior", "KHR_texture_basisu"]), HALVES[:1]),
     ("draco alone.glb", a_glb(CORNER, extensionsUsed=UNREAD[:1], accessor={"bufferView": None}), "no data.*without KHR_draco"),
     ("no fallback.glb", a_glb(CORNER, extensionsUsed=UNREAD[1:2], buffers=[{"byteLength": 512}]), "states 512.*without EXT_meshopt"),
-    ("sparse.glb", a_glb(CORNER, accessor={"sparse": SPARSE}), "without sparse accessors"),
+    ("sparse.glb", a_glb(CORNER, accessor={"sparse": {"count": 1, "indices": {"bufferView": 0, "componentType": 5121}, "values": {"bufferView": 0}}}), "without sparse accessors"),
     ("skin.glb", a_glb(CORNER, node={"skin": 0}), r"nodes\[0\] is posed by a skin.*apply the armature"),
     ("morph.glb", a_glb(CORNER, mesh={"weights": [0, 0.5]}), "morph targets"),
     ("no morph.glb", a_glb(CORNER, mesh={"weights": [1]}, node={"weights": [0]}), HALVES[:1]),
@@ -177,7 +181,7 @@ MEANING = [
     ("fan.glb", a_glb(SQUARE[[0, 1, 3, 2]], primitive={"mode": 6}), [(0, 1, 3), (0, 3, 2)]),
     ("quantized.glb", a_glb((CORNER * 4).astype("<i2"), accessor={"normalized": False}, node={"scale": [0.25] * 3},
                             extensionsRequired=["KHR_mesh_quantization"]), HALVES[:1]),
-    ("fractions.glb", a_glb(QUADS_OF_SHORTS, accessor={"type": "VEC3"}, view={"byteStride": 12}), HALVES[:1]),
+    ("fractions.glb", a_glb(np.pad((CORNER * 32767).astype("<i2"), ((0, 0), (0, 3))), accessor={"type": "VEC3"}, view={"byteStride": 12}), HALVES[:1]),
     ("padded.glb", a_glb(CORNER, zeros="\0").replace(b', "zeros": "\\u0000"}', b"}" + bytes(19)), HALVES[:1]),
     ("beyond.glb", a_glb(CORNER, primitive={"attributes": {"POSITION": 9}}), r"refers to accessors\[9\], but has 1 accessors"),
     ("short.glb", a_glb(CORNER, accessor={"count": 9}), r"accessors\[0\] needs 108 bytes of a buffer view, which has 99"),
