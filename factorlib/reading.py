@@ -39,6 +39,8 @@ TERSE = {  # words for exceptions whose own are Python's
     TypeError: "a value in it is of another kind than expected",
     AttributeError: "a value in it is of another kind than expected",
     AssertionError: "its parts contradict each other",
+    RecursionError: "it is nested too deeply",
+    MemoryError: "it does not fit into memory",
 }
 COPY_AGAIN = "the file may be incomplete, or of another format than its suffix: copy it again from its source"
 MOST_BYTES = 1 << 30  # largest file that is read as a whole
@@ -99,10 +101,6 @@ def _fault(error: BaseException, kind: str) -> str:
     >>> _fault(KeyError("frames"), "JSON"), _fault(AssertionError(), "a mesh")
     ("not readable as JSON (it has no entry 'frames')", 'not readable as a mesh (its parts contradict each other)')
     """
-    if isinstance(error, RecursionError):
-        return f"not readable as {kind}: it is nested too deeply"
-    if isinstance(error, MemoryError):
-        return f"not readable as {kind}: it does not fit into memory"
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
     words = next((words.format(error) for family, words in TERSE.items() if isinstance(error, family)), str(error))
@@ -134,13 +132,21 @@ def check_plain(file: str | os.PathLike, kind: str, key: str | None = None, most
     with reading(kind, file, key):
         status = os.stat(file)
         if not stat.S_ISREG(status.st_mode):
-            fault = f"is {KINDS.get(stat.S_IFMT(status.st_mode), 'no plain file')}, not a file"
-            raise InputError(fault, file=file, key=key, cure=f"put {kind} there, or correct the path")
+            raise InputError(
+                f"is {KINDS.get(stat.S_IFMT(status.st_mode), 'no plain file')}, not a file",
+                file=file,
+                key=key,
+                cure=f"put {kind} there, or correct the path",
+            )
         if not os.access(file, os.R_OK, effective_ids=os.access in os.supports_effective_ids):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     if most_bytes is not None and status.st_size > most_bytes:
-        fault = f"has {status.st_size / 1e6:,.1f} MB; {kind} has {most_bytes / 1e6:,.1f} MB at most"
-        raise InputError(fault, file=file, key=key, cure="name another file, or make this one smaller")
+        raise InputError(
+            f"has {status.st_size / 1e6:,.1f} MB; {kind} has {most_bytes / 1e6:,.1f} MB at most",
+            file=file,
+            key=key,
+            cure="name another file, or make this one smaller",
+        )
     return status.st_size
 
 

@@ -85,9 +85,8 @@ class Validation:
             return []
         lights = sorted(light for light, names in by_light.items() if names)
         members = [[light for light in lights if component[min(by_light[light])] == k] for k in range(groups)]
-        group_list = "; ".join(map(", ".join, members))
         return [
-            f"the lights fall into {groups} groups that share no material ({group_list}): "
+            f"the lights fall into {groups} groups that share no material ({'; '.join(map(', '.join, members))}): "
             "brightness and colour cannot be compared between them. "
             "A photo that shows a material of each would link them"
         ]

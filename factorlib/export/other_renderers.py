@@ -82,7 +82,7 @@ def evaluate_solved_brdf(material: Reflectance, angles: Angles) -> BrdfTerms:
 def mtlx(material: Reflectance, angles: Angles) -> BrdfTerms:
     """Evaluate the nodes of `factorlib.export.materialx`."""
     weight, _, specular = material.mixture
-    brighter = 1 + np.multiply.outer(1 / albedo(material.alpha, angles.no) - 1, specular)
+    brighter = 1 + np.multiply.outer(1 / np.interp(angles.no, *albedo_table(material.alpha)) - 1, specular)
     return _brdf_terms(
         angles, material.diffuse, weight * np.array(specular) * brighter, correlated_smith(material.alpha, angles)
     )
@@ -90,7 +90,7 @@ def mtlx(material: Reflectance, angles: Angles) -> BrdfTerms:
 
 def mtlx_standard_surface(material: Reflectance, angles: Angles) -> BrdfTerms:
     """Evaluate the standard surface of `factorlib.export.materialx`; for its F of 1, E · (1 + (1 − E)/E) = 1."""
-    specular = np.multiply.outer(1 / albedo(material.alpha, angles.no), material.specular)
+    specular = np.multiply.outer(1 / np.interp(angles.no, *albedo_table(material.alpha)), material.specular)
     return _brdf_terms(angles, material.diffuse, specular, correlated_smith(material.alpha, angles))
 
 
@@ -130,13 +130,9 @@ def _root(alpha: float, cosine: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*
     return np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)
 
 
-def albedo(alpha: float, no: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Return E, the albedo of a height-correlated GGX of F = 1 at each n·o, interpolated in a table."""
-    return np.interp(no, *_albedo_table(alpha))
-
-
 @cache
-def _albedo_table(alpha: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def albedo_table(alpha: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return cosines n·o, and E, the albedo of a height-correlated GGX of F = 1, at each of them."""
     nodes = (np.arange(ALBEDO_NODES) + 1) / ALBEDO_NODES
     angles, weight = sample_directions(alpha, nodes, ALBEDO_SAMPLES)
     return nodes, (weight * correlated_smith(alpha, angles)).mean(axis=-1)

@@ -161,8 +161,12 @@ def _refused(fault: str, path: str | Path, key: str | None) -> Iterator[None]:
     except rawpy.LibRawError as error:
         text = error.args[0] if error.args else error
         reason = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
-        cure = f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif"
-        raise InputError(f"{fault} ({reason})", file=path, key=key, cure=cure) from None
+        raise InputError(
+            f"{fault} ({reason})",
+            file=path,
+            key=key,
+            cure=f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif",
+        ) from None
 
 
 def _crop(sizes: Any) -> tuple[slice, slice]:

@@ -57,8 +57,12 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     opened = open_photo(path, key)
     height, width = opened.size
     if width != 2 * height:
-        fault = f"has {width} × {height} pixels; a lat-long map is twice as wide as high"
-        raise InputError(fault, file=path, key=key, cure="name a lat-long map, or convert this one")
+        raise InputError(
+            f"has {width} × {height} pixels; a lat-long map is twice as wide as high",
+            file=path,
+            key=key,
+            cure="name a lat-long map, or convert this one",
+        )
     least = np.inf
     total = 0.0
     lost = 0
@@ -76,11 +80,19 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     factor = next((divisor for divisor in range(factor, 2 * factor) if height % divisor == 0), factor)
     radiance = decode_photo(opened, "linear", factor, path, look).radiance
     if lost:
-        fault = f"{lost} pixels are NaN, infinite or above {LARGEST:g}"
-        raise InputError(fault, file=path, key=key, cure="replace these pixels, or export the map again")
+        raise InputError(
+            f"{lost} pixels are NaN, infinite or above {LARGEST:g}",
+            file=path,
+            key=key,
+            cure="replace these pixels, or export the map again",
+        )
     if least < LEAST * total / (3 * height * width):
-        cure = "set negative values to 0 (some resampling filters make them), or export the map again, linear"
-        raise InputError(f"has a radiance of {least:.4g}, less than 0", file=path, key=key, cure=cure)
+        raise InputError(
+            f"has a radiance of {least:.4g}, less than 0",
+            file=path,
+            key=key,
+            cure="set negative values to 0 (some resampling filters make them), or export the map again, linear",
+        )
     if not (radiance > 0).any():
         raise InputError("the map is black", file=path, key=key, cure="name another map, or export this one again")
     return radiance.astype(float)

@@ -135,9 +135,7 @@ def decode_photo(
         path: File to name in warnings.
         look: Called with the linear values of the file, some rows at a time, before they are averaged.
     """
-    space = opened.space
-    if encoding is not None:
-        space = ColourSpace((DECODERS[encoding],) * 3, space.to_rec709)
+    space = opened.space if encoding is None else ColourSpace((DECODERS[encoding],) * 3, opened.space.to_rec709)
     height, width = (n // factor for n in (opened.height, opened.width))
     radiance = np.empty((height, width, 3), np.float32)
     clipped = np.empty((height, width, 3), bool)
@@ -183,16 +181,14 @@ def _strips(
     columns = slice(left, left + opened.width // factor * factor)
     height = opened.height // factor
     step = max(1, READ_AT_ONCE // (factor * opened.width))
-    for first in range(0, height, step):
-        last = min(first + step, height)
-        begin = top + first * factor
-        end = top + last * factor
-        with reading("an image", path):
+    with reading("an image", path):
+        for first in range(0, height, step):
+            last = min(first + step, height)
+            begin = top + first * factor
+            end = top + last * factor
             codes = opened.rows(begin, end)
-            clipped = opened.clipped(begin, end, codes)
-        yield slice(first, last), codes[:, columns], clipped[:, columns]
-    if end < opened.height:
-        with reading("an image", path):
+            yield slice(first, last), codes[:, columns], opened.clipped(begin, end, codes)[:, columns]
+        if end < opened.height:
             opened.rows(end, opened.height)  # a file that is truncated in the remainder must raise too
 
 

@@ -111,12 +111,20 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
         head = stream.read(4096)  # the header, if it is a Radiance file
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
-        fault = f"not readable as an image ({one_line(oiio.geterror())})"
-        cure = "the file is damaged or has a wrong suffix: copy or export it again"
+        words = one_line(oiio.geterror())
         if b"FORMAT=32-bit_rle_xyze" in head:
-            fault = "is a Radiance picture of XYZE, which is not read"
-            cure = f"convert it to RGBE: ra_xyze -r {Path(path).name} out.hdr"
-        raise InputError(fault, file=path, key=key, cure=cure)
+            raise InputError(
+                "is a Radiance picture of XYZE, which is not read",
+                file=path,
+                key=key,
+                cure=f"convert it to RGBE: ra_xyze -r {Path(path).name} out.hdr",
+            )
+        raise InputError(
+            f"not readable as an image ({words})",
+            file=path,
+            key=key,
+            cure="the file is damaged or has a wrong suffix: copy or export it again",
+        )
     spec, colours = _picture(source, path, key)
     _check_kind(spec, path, key)
     orientation = spec.get_int_attribute("Orientation", 1)
@@ -129,10 +137,10 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
         white = 2**8 - 1
     elif white is None:
         rows = _in_display_window(rows, spec)
-    if source.format_name() in ("openexr", "hdr"):
-        space = _scene_space(spec, head, path)
-    else:
-        space = colour_space(path, attributes, SRGB if white else LINEAR, key)
+    is_scene = source.format_name() in ("openexr", "hdr")
+    space = (
+        _scene_space(spec, head, path) if is_scene else colour_space(path, attributes, SRGB if white else LINEAR, key)
+    )
     return OpenPhoto(
         width=size[1],
         height=size[0],
@@ -240,8 +248,12 @@ def _check_kind(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> None
         f"its pixels are not square, but of aspect {aspect:.3g}": abs(aspect - 1) > SAME_ASPECT,
     }
     if fault := next((fault for fault, is_true in faults.items() if is_true), None):
-        cure = "save it as RGB of 8 or 16 bits, flat, in square pixels"
-        raise InputError(f"not readable as a photo: {fault}", file=path, key=key, cure=cure)
+        raise InputError(
+            f"not readable as a photo: {fault}",
+            file=path,
+            key=key,
+            cure="save it as RGB of 8 or 16 bits, flat, in square pixels",
+        )
 
 
 def _base_rows(path: str | Path) -> Rows:

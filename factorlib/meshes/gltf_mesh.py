@@ -36,13 +36,12 @@ def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
         ValueError: If it is malformed; LookupError is possible too.
     """
     header = read_header(path, most_bytes=limits.bytes)
-    meshes = (header.entry("meshes", node.mesh) for node in header.nodes if node.mesh is not None)
+    meshes = [header.entry("meshes", node.mesh) for node in header.nodes if node.mesh is not None]
     limits.check_parts(sum(len(mesh.primitives) for mesh in meshes), path)
     with np.errstate(all="ignore"):  # values that are not finite are refused later
         parts = _parts(header, path)
         sizes = [_size(header, primitive, instances) for primitive, _, _, instances in parts]
-        vertices, triangles = np.array(sizes, object).reshape(-1, 2).sum(axis=0).tolist()
-        limits.check(vertices, triangles, path)
+        limits.check(sum(vertices for vertices, _ in sizes), sum(triangles for _, triangles in sizes), path)
         parts = [part for part, size in zip(parts, sizes) if size[1]]
         decoder = _Decoder(header, path, limits)
         pieces = [_piece(decoder, part) for part in parts] or [(np.empty((0, 3)),) * 3]
@@ -76,9 +75,12 @@ class _Decoder:
                 left = limits.bytes - sum(map(len, self.buffers))
                 content = read_bytes(path.parent / name, "a glTF buffer", most_bytes=max(left, 0))
             if len(content) < buffer.byteLength:
-                fault = f"buffers[{index}] has {len(content)} bytes, but the header states {buffer.byteLength}"
                 names = unread(header.extensionsUsed)
-                raise InputError(fault, file=path, cure=f"export it again without {names}" if names else CURE)
+                raise InputError(
+                    f"buffers[{index}] has {len(content)} bytes, but the header states {buffer.byteLength}",
+                    file=path,
+                    cure=f"export it again without {names}" if names else CURE,
+                )
             self.buffers.append(content)
 
     def array(self, index: int, width: int, count: int | None = None) -> Float[np.ndarray, "n w"]:
@@ -91,12 +93,17 @@ class _Decoder:
         """
         accessor = self.header.entry("accessors", index)
         if accessor.bufferView is None or accessor.sparse is not None:
-            cure = f"export it again without {unread([*self.header.extensionsUsed, 'sparse accessors'])}"
-            raise InputError(f"accessors[{index}] is sparse, or has no data", file=self.path, cure=cure)
+            raise InputError(
+                f"accessors[{index}] is sparse, or has no data",
+                file=self.path,
+                cure=f"export it again without {unread([*self.header.extensionsUsed, 'sparse accessors'])}",
+            )
         count = accessor.count if count is None else count
         if WIDTHS.get(accessor.type) != width or accessor.count != count:
-            has = f"accessors[{index}] has {accessor.count} elements of type {accessor.type}"
-            raise ValueError(f"{has}, where {count} of {width} numbers are needed")
+            raise ValueError(
+                f"accessors[{index}] has {accessor.count} elements of type {accessor.type}, "
+                f"where {count} of {width} numbers are needed"
+            )
         view = self.header.entry("bufferViews", accessor.bufferView)
         data = memoryview(self.buffers[view.buffer])[view.byteOffset :][: view.byteLength]
         kind = np.dtype(KINDS[accessor.componentType])

@@ -47,9 +47,10 @@ class _Tables:
             return
         vertices = len(self.coordinates["v"]) // 3
         normals = len(self.coordinates["vn"]) // 3
-        corners = []
-        for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words):
-            corners.append((_index(vertex, vertices), _index(normal, normals) if normal else -1))
+        corners = [
+            (_index(vertex, vertices), _index(normal, normals) if normal else -1)
+            for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words)
+        ]
         if len(corners) < 3:
             raise ValueError("a face needs at least three corners")
         names = tuple(dict.fromkeys(name for kind in self.names.values() for name in kind if name))

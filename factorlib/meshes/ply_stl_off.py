@@ -144,8 +144,11 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
                 case _:
                     raise ValueError(line)
         except (ValueError, LookupError, TypeError) as error:
-            fault = f"its header has {quoted(' '.join(line.split()))}, which no PLY header has, or has it twice"
-            raise InputError(fault, file=path, cure=CURE) from error
+            raise InputError(
+                f"its header has {quoted(' '.join(line.split()))}, which no PLY header has, or has it twice",
+                file=path,
+                cure=CURE,
+            ) from error
     if order is None:
         raise InputError("its header has no line `format`", file=path, cure=CURE)
     _check_room(elements, order, len(content) - start, path)
@@ -215,18 +218,17 @@ def _columns(content: bytes, offset: int, order: str, count: int, properties: Pr
         fields: list[tuple[str, np.dtype, tuple[int, ...]]] = []
         place = offset
         for number, (kind, counter) in enumerate(kinds):
+            length = 1
             if counter:
                 fields.append((f"n{number}", counter, ()))
                 number_bytes = content[place : place + counter.itemsize].ljust(counter.itemsize, b"\0")
                 length = np.frombuffer(number_bytes, counter)[0].item()
-                if length < 0:
-                    raise ValueError(f"a list has the length {length}, which must be at least 0")
                 place += counter.itemsize
-            lengths.append(length if counter else 1)
-            fields.append((f"v{number}", kind, (lengths[-1],)))
-            place += lengths[-1] * kind.itemsize
-            if place > len(content):
-                raise ValueError("the file ends in the middle of its rows")
+            lengths.append(length)
+            fields.append((f"v{number}", kind, (length,)))
+            place += length * kind.itemsize
+            if length < 0 or place > len(content):
+                raise ValueError("a list has a length below 0, or the file ends in the middle of its rows")
         # read ahead as many rows as have lists of the same lengths
         layout = np.dtype(fields)
         rows = np.frombuffer(
@@ -240,7 +242,7 @@ def _columns(content: bytes, offset: int, order: str, count: int, properties: Pr
             sizes.append(np.full(len(rows), lengths[number]))
         row = row + len(rows)
         offset = offset + len(rows) * layout.itemsize
-    joined = [(np.concatenate(values[1:] or values), np.concatenate(sizes)) for values, sizes in pieces]
+    joined = ((np.concatenate(values[1:] or values), np.concatenate(sizes)) for values, sizes in pieces)
     return dict(zip(properties, joined)), offset
 
 

@@ -146,8 +146,9 @@ class MeshCache:
 def _check_nodes(values: Iterable[np.ndarray], mesh: SubdividedMesh, file: Path, stage: str) -> None:
     """Check that there is one value for each node, as a stage estimated them; InputError otherwise."""
     if any(len(one) != mesh.nodes for one in values):
-        fault = f"this is not the mesh whose surface the stage `{stage}` estimated"
-        raise InputError(fault, file=file, cure=f"run `{stage}` again")
+        raise InputError(
+            f"this is not the mesh whose surface the stage `{stage}` estimated", file=file, cure=f"run `{stage}` again"
+        )
 
 
 def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:
@@ -204,8 +205,11 @@ def part_labels(
         candidates = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})
         title = one_line(" / ".join(part_names)) or "(unnamed)"
         if len(candidates) > 1:
-            fault = f"part {title} gets several materials: {', '.join(sorted(filter(None, candidates)))}"
-            raise InputError(fault, file=file, cure="give a material to one of its names only")
+            raise InputError(
+                f"part {title} gets several materials: {', '.join(sorted(filter(None, candidates)))}",
+                file=file,
+                cure="give a material to one of its names only",
+            )
         if None in candidates:
             example = f"add it to `parts`, e.g. {one_line(part_names[0])}: {materials[0]}" if part_names else None
             cure = example or "name the part in a mesh editor"

@@ -90,18 +90,28 @@ def make(folder: Path) -> Inputs:
     facts, poses = {"dataset.materials": NAMES, "dataset.light": {}, "dataset.ground": {}, "dataset.objects": {}}, {}
     for photo, mesh in MESHES.items():
         world, camera, pose = WORLD_FROM_CAMERA[photo], CAMERAS[photo], POSES[photo]
-        light = {"illumination": LIGHTS[photo], "world_from_camera": None if world is None else world.tolist()}
-        meshes = {mesh: {"file": f"{mesh}.obj", "parts": PARTS[mesh]}}
-        facts["dataset.light"][photo], facts["dataset.ground"][photo] = light, {"ground": None}
-        chair = {"camera": {}, "objects": [{"name": "chair", "mesh": mesh}], "meshes": meshes}
-        facts["dataset.objects"][photo] = chair
+        facts["dataset.light"][photo] = {
+            "illumination": LIGHTS[photo],
+            "world_from_camera": None if world is None else world.tolist(),
+        }
+        facts["dataset.ground"][photo] = {"ground": None}
+        facts["dataset.objects"][photo] = {
+            "camera": {},
+            "objects": [{"name": "chair", "mesh": mesh}],
+            "meshes": {mesh: {"file": f"{mesh}.obj", "parts": PARTS[mesh]}},
+        }
         place = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}
         lens = {"focal_px": camera.focal, "principal_point": list(camera.centre)}
         poses[photo] = {"camera": lens, "objects": {"chair": place}}
         maps = rasterise(read_mesh(files[f"{mesh}.obj"], NAMES, PARTS[mesh]), camera, pose)
-        inside, each = maps.label > 0, [(kind, a, k) for kind in ("normal", "view") for k, a in enumerate("xyz")]
-        channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind, a, k in each}
-        channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": inside}
+        inside = maps.label > 0
+        channels = {
+            **{f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")},
+            "depth": maps.depth,
+            "label": maps.label,
+            "object": maps.object,
+            "confidence": inside,
+        }
         write_exr(folder / "align" / f"{photo}.exr", channels)
         grey = {c: 0.3 * inside for c in "RGB"} | {"label": maps.label, "valid": inside, "left_out": 0 * inside}
         write_exr(folder / "masks" / f"{photo}.exr", grey)

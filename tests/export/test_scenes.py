@@ -31,8 +31,6 @@ from factorlib.tracing.scene import mitsuba_map, node_directions, paint, rigid, 
 from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
 
-SPP = 1024
-
 
 def rendered(path, **options) -> np.ndarray:
     module = mitsuba()
@@ -65,7 +63,7 @@ def test_scene_equals_resynthesis(exported, photo):
     pixels = whole_pixels(geometry["label"])
     reflector, materials = Reflector(Reference(tolerance=1e-3), light), [table[n] for n in made_export.NAMES]
     expected = resynthesise(reflector, materials, {"label": masks["label"] * pixels}, geometry).sum(0)
-    result = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
+    result = rendered(out / "scenes" / f"{photo}.xml", spp=1024)
     error = block_means(result, pixels) / block_means(expected, pixels) - 1
     assert len(error) >= 15
     assert np.abs(error).max() < 0.01
@@ -178,7 +176,6 @@ PHOTOS = list(made_export.MESHES)
 GLOSSY = Reflectance((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.45)
 METAL = Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7)
 LAMBERTIAN = Reflectance((0.5, 0.4, 0.3), (0, 0, 0), 0.2)
-MISSING = 'OpenUSD is not installed: make setup EXTRAS="interchange"'
 
 
 # as text -------------------------------------------------------------------------------------------------------------
@@ -228,7 +225,7 @@ def test_shader_reflects_what_was_solved_at_normal_incidence(material):
 
 @pytest.fixture(scope="module")
 def pxr():
-    return pytest.importorskip("pxr", reason=MISSING)
+    return pytest.importorskip("pxr", reason='OpenUSD is not installed: make setup EXTRAS="interchange"')
 
 
 def opened(exported, photo):

@@ -75,15 +75,6 @@ def test_image_has_each_vertex_colour_and_every_face_a_place_in_it(name):
     np.testing.assert_allclose(colours_at(image, middles[0]), middles[1], atol=0.04)
 
 
-def test_images_are_the_same_bytes_again():
-    mesh = painted(MESHES["torus"])
-    first = unwrap(mesh)
-    texture_atlas._charts.cache_clear()
-    second = unwrap(mesh)
-    assert first.uv.tobytes() == second.uv.tobytes() and first.faces.tobytes() == second.faces.tobytes()
-    assert bake(first).tobytes() == bake(second).tobytes()
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """An export in which the egg is painted, the ball is not."""

@@ -219,18 +219,22 @@ def test_sigterm_ends_a_run_as_an_interrupt_does(fresh):
 
 def test_sigterm_prints_no_stack_after_files_were_validated():
     """pycolmap, which validation imports, has a handler of its own."""
-    code = "import os, pathlib, signal; from factorlib.runner.project import photo_sets; "
-    code += "photo_sets().read(pathlib.Path('data/eames'), ()).cautions(); os.kill(os.getpid(), signal.SIGTERM)"
+    code = (
+        "import os, pathlib, signal; from factorlib.runner.project import photo_sets; "
+        "photo_sets().read(pathlib.Path('data/eames'), ()).cautions(); os.kill(os.getpid(), signal.SIGTERM)"
+    )
     process = subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, capture_output=True, text=True)
     assert process.returncode == -signal.SIGTERM and not process.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_make_photos_ends_at_a_signal_inside_native_code_and_removes_what_it_began(tmp_path, number):
-    code = "import ctypes, pathlib, tempfile; from factorlib.runner.verbs import ended_by_signals\n"
-    code += f"with ended_by_signals(pathlib.Path({str(tmp_path / 'mine')!r})):\n    import pycolmap; "
-    code += f"print(tempfile.mkdtemp(), tempfile.mkdtemp(dir={str(tmp_path)!r}, prefix='.mine.'), flush=True); "
-    code += "ctypes.CDLL(None).sleep(60)"
+    code = (
+        "import ctypes, pathlib, tempfile; from factorlib.runner.verbs import ended_by_signals\n"
+        f"with ended_by_signals(pathlib.Path({str(tmp_path / 'mine')!r})):\n    import pycolmap; "
+        f"print(tempfile.mkdtemp(), tempfile.mkdtemp(dir={str(tmp_path)!r}, prefix='.mine.'), flush=True); "
+        "ctypes.CDLL(None).sleep(60)"
+    )
     words = [sys.executable, "-c", code]
     with subprocess.Popen(words, cwd=LIBRARY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         folders = process.stdout.readline().split()

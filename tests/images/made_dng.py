@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from PIL.TiffTags import ASCII, BYTE, LONG, RATIONAL, SHORT, SIGNED_RATIONAL
 
-BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
 XYZ_TO_SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)  # fmt: skip  # a sensor that sees Rec. 709
 WHITE, BLACK = 4000, 64
 
@@ -26,7 +26,7 @@ def write_dng(path: Path, sensor: np.ndarray, *, neutral=(1.0, 1.0, 1.0), exif=N
         254: (LONG, 1), 256: (LONG, 12), 257: (LONG, 8), 258: (SHORT, [8, 8, 8]), 259: (SHORT, 1), 262: (SHORT, 2),
         271: (ASCII, "Made"), 272: (ASCII, "By hand"), 273: (LONG, 0), 274: (SHORT, 1), 277: (SHORT, 3), 278: (LONG, 8),
         279: (LONG, 3 * 8 * 12), 284: (SHORT, 1), 50706: (BYTE, bytes([1, 4, 0, 0])), 50708: (ASCII, "Made by hand"),
-        50721: (SRATIONAL, XYZ_TO_SRGB), 50728: (RATIONAL, neutral), 50778: (SHORT, 21),
+        50721: (SIGNED_RATIONAL, XYZ_TO_SRGB), 50728: (RATIONAL, neutral), 50778: (SHORT, 21),
     }  # fmt: skip
     content = b""
     for tag, entries, pixels in ((330, raw, sensor.astype("<u2").tobytes()), (34665, exif, b"")):

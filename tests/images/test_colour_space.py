@@ -114,7 +114,6 @@ def chrm(values):
     return struct.pack(">8I", *np.rint(1e5 * np.array(values)).astype(int))
 
 
-TRANSFER = tuple(int(v) for v in codes(np.linspace(0, 1, 256) ** GAMMA, np.uint16))
 P3_PNG = stored(P3, srgb_encode)
 READ = {  # file, radiance, tolerance
     "ICC, parametric": (png(P3_PNG, iCCP=iccp(P3, SRGB_PARA)), WIDE, 5e-4),
@@ -147,7 +146,12 @@ READ = {  # file, radiance, tolerance
     ),
     "PNG, another white": (png(GREY, gAMA=gama(1), cHRM=chrm((0.3457, 0.3585, *ADOBE_XY[2:]))), GREY, 5e-5),
     "TIFF's own tags": (
-        tiff(stored(ADOBE, adobe), _301=3 * TRANSFER, _318=ADOBE_XY[:2], _319=ADOBE_XY[2:]),
+        tiff(
+            stored(ADOBE, adobe),
+            _301=3 * tuple(codes(np.linspace(0, 1, 256) ** GAMMA, np.uint16).tolist()),
+            _318=ADOBE_XY[:2],
+            _319=ADOBE_XY[2:],
+        ),
         WIDE,
         0.01,
     ),

@@ -7,13 +7,14 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from PIL.TiffTags import LONG, RATIONAL, SHORT
 
 from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import box_mean, check_bright, decode_photo, open_photo, read_photo
 from factorlib.images.tone import srgb_decode, srgb_encode
-from tests.images.made_dng import BLACK, LONG, RATIONAL, SHORT, WHITE, write_dng
+from tests.images.made_dng import BLACK, WHITE, write_dng
 from tests.refusal import refusal
 
 RNG = np.random.default_rng(3)
@@ -192,12 +193,12 @@ def test_colours_of_other_primaries_are_rec709_and_those_of_rec709_the_same_bits
 
     plain = read_photo(save(tmp_path / f"b.{suffix}", RADIANCE)).radiance
     assert np.array_equal(read(REC709, RADIANCE), plain)
-    whites = [XYZ @ read(space, np.ones((2, 8, 3), np.float32))[0, 0] for space in (AP1, AP0)]
     red = XYZ @ read(AP1, np.full((2, 8, 3), (0.5, 0, 0), np.float32))[0, 0]
     assert red / red.sum() == pytest.approx([0.713, 0.293, -0.006], abs=1e-3) and red[1] == pytest.approx(
         0.5 * 0.2722, abs=1e-3
     )
-    for white in whites:
+    for space in (AP1, AP0):
+        white = XYZ @ read(space, np.ones((2, 8, 3), np.float32))[0, 0]
         assert white / white.sum() == pytest.approx([0.32168, 0.33767, 0.34065], abs=1e-3)
     assert np.array_equal(read((0,) * 8, RADIANCE), plain)  # as OpenImageIO writes what it does not know
     refusal("chromaticities", read, (0.3, 0.4) * 4, RADIANCE)

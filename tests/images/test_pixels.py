@@ -106,8 +106,7 @@ def test_sharpening_is_seen_and_what_cameras_and_scenes_do_is_not(body, ground):
 
 
 def test_too_few_contours_and_pixels_that_are_left_out_say_nothing():
-    linear = sharpened(picture(0.6, 0.1), 2.0, 1.0)
-    of_three = np.repeat(linear[..., None], 3, axis=-1)
+    of_three = np.repeat(sharpened(picture(0.6, 0.1), 2.0, 1.0)[..., None], 3, axis=-1)
     assert halo(of_three, INSIDE, INSIDE) == 0
     assert halo(of_three, np.hypot(ROW - 60, COLUMN - 80) < 4, KNOWN) == 0
 

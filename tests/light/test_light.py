@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad
+from scipy.linalg import block_diag
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.sphere import fibonacci_sphere
@@ -65,21 +66,11 @@ def directions(count=256):
     return torch.from_numpy(fibonacci_sphere(count))
 
 
-def behind(edge, d):
-    """Visibility of points that do not see beyond a plane edge: n points, k directions."""
-    return (d @ edge.T > 0).T.double()
-
-
 def weights_of(part, normals, views, d, roughness=0.4):
-    if part == "diffuse":
-        return cosine_weights(normals, d)
-    return highlight_weights(normals, views, d, roughness)
+    return cosine_weights(normals, d) if part == "diffuse" else highlight_weights(normals, views, d, roughness)
 
 
-PARTS = pytest.mark.parametrize("part", ["diffuse", "specular"])
-
-
-@PARTS
+@pytest.mark.parametrize("part", ["diffuse", "specular"])
 def test_who_sees_everything_sees_all_of_every_lobe_and_shares_lie_between_none_and_all(part):
     (normals, views), d = points(), directions()
     lobes = kernel(d, unit(50), torch.logspace(-1, 3.3, 50).double())
@@ -95,9 +86,8 @@ def test_constant_light_is_seen_through_the_cosine_weighted_open_part_of_the_hem
     tilt = torch.linspace(0, 1.5, 40).double()[:, None]
     across = torch.linalg.cross(normals, unit(40))
     edge = torch.cos(tilt) * normals + torch.sin(tilt) * across / across.norm(dim=1, keepdim=True)
-    share = visible_share(
-        behind(edge, d), cosine_weights(normals, d), kernel(d, unit(1), torch.tensor([1e-3]).double())
-    )
+    above = (d @ edge.T > 0).T.double()  # n points, k directions
+    share = visible_share(above, cosine_weights(normals, d), kernel(d, unit(1), torch.tensor([1e-3]).double()))
     np.testing.assert_allclose(share, (1 + torch.cos(tilt)) / 2, atol=0.02)
 
 
@@ -225,9 +215,7 @@ def test_covariance_is_that_of_the_equation_and_positive_definite_without_a_nugg
 
 def test_precision_is_the_inverse_of_the_covariance_of_log_radiance():
     directions = fibonacci_sphere(12)
-    of_y = np.zeros((36, 36))
-    for k in range(3):
-        of_y[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] = KNOWN.covariance(k, directions)
+    of_y = block_diag(*(KNOWN.covariance(k, directions) for k in range(3)))
     unmix = np.kron(np.linalg.inv(MIX), np.eye(12))
     precision, log_determinant = KNOWN.precision(directions)
     np.testing.assert_allclose(precision @ unmix @ of_y @ unmix.T, np.eye(36), atol=1e-8)
