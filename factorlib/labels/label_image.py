@@ -6,6 +6,7 @@ material, two materials in one pixel, no labelled pixel at all.
 
 import logging
 from collections.abc import Callable, Mapping
+from math import prod
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -66,17 +67,18 @@ def read_labels(
     mask_file = file(masks if isinstance(masks, str) else next(iter(masks.values())))
     if not isinstance(masks, str):
         places = {name: (file(masks[name]), f"{key}.{name}") for name in sorted(masks, key=materials.index)}
-        labels = _merged({name: read_inside(*place, size) for name, place in places.items()}, materials, places, edge=0)
+        inside = {name: read_inside(*place, size) for name, place in places.items()}
+        labels = _merged(inside, materials, places, size, edge=0)
     elif masks.lower().endswith(".json"):
         inside = read_coco(mask_file, image, materials, size, key)
-        labels = _merged(inside, materials, dict.fromkeys(inside, (mask_file, key)), edge=DRAWN_EDGE)
+        labels = _merged(inside, materials, dict.fromkeys(inside, (mask_file, key)), size, edge=DRAWN_EDGE)
     else:
         folder = mask_file.parents[len(PurePosixPath(masks).parts) - 1]
         labelmap = labelmap_beside(masks, folder)
         values = read_colours(mask_file, folder / labelmap, materials, size, key) if labelmap else None
         values = read_values(mask_file, key, size) if values is None else values
         labels = _labels_of_png(values, mask_file, materials, key)
-    if labels is None or not labels.label.any():
+    if not labels.label.any():
         raise InputError(
             "the mask is empty: no pixel has a material",
             file=mask_file,
@@ -116,11 +118,9 @@ def read_object_indices(
                 key=mask_key,
                 cure="paint it, or leave the key out",
             )
-        if objects[inside].any():
-            overlapped = int(objects[inside & (objects > 0)][0]) - 1
-            count = int((objects[inside] == overlapped + 1).sum())
+        if len(shared := objects[inside & (objects > 0)]):
             raise InputError(
-                f"objects {masks[overlapped][0]!r} and {name!r} share {count} pixels",
+                f"objects {masks[shared[0] - 1][0]!r} and {name!r} share {np.sum(shared == shared[0])} pixels",
                 file=file(path),
                 key=mask_key,
                 cure="a pixel shows one object: erase it from the one behind",
@@ -153,25 +153,27 @@ def check_materials(
     Raises:
         InputError: If both faults occur.
     """
-    groups = [([k], objects == k + 1) for k in range(len(object_materials)) if (objects == k + 1).any()]
-    unmasked = [k for k in range(len(object_materials)) if not (objects == k + 1).any()]
-    for members, region in [*groups, (unmasked, objects == 0)] if unmasked else groups:
-        counts = np.bincount(labels.label[region], minlength=len(materials) + 1)[1:]
+    # number of pixels of each object (0: of none) and label, in the smallest type that holds both
+    shape = len(object_materials) + 1, len(materials) + 1
+    pairs = labels.label + objects * np.min_scalar_type(prod(shape)).type(shape[1])
+    table = np.bincount(pairs.ravel(), minlength=prod(shape)).reshape(shape).tolist()
+    groups = [([k], row) for k, row in enumerate(table[1:]) if any(row)]
+    unmasked = [k for k, row in enumerate(table[1:]) if not any(row)]
+    for members, (_, *row) in [*groups, (unmasked, table[0])]:
+        counts = dict(zip(materials, row))
         expected = set().union(*(object_materials[k][1] for k in members))
-        unexpected = [
-            k for k, count in enumerate(counts) if count >= MUCH * counts.sum() > 0 and materials[k] not in expected
-        ]
-        missing = [name for name in materials if name in expected and not counts[materials.index(name)]]
-        if unexpected and missing:
+        missing = [name for name in materials if name in expected and not counts[name]]
+        most = max((name for name in materials if name not in expected), key=counts.__getitem__, default=None)
+        if missing and most and counts[most] >= MUCH * sum(row) > 0:
             owners = ", ".join(repr(object_materials[k][0]) for k in members)
-            most = max(unexpected, key=counts.__getitem__)
-            fault = (
-                f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {owners}, "
-                f"but no {missing[0]!r}"
+            raise InputError(
+                f"the mask shows {most!r} in {counts[most] / sum(row):.0%} of the pixels of {owners}, "
+                f"but no {missing[0]!r}",
+                file=path,
+                key=f"{key}[{members[0]}].materials",
+                cure=f"correct the materials in dataset.yaml (there {', '.join(sorted(expected))}), "
+                "or the labels of the mask",
             )
-            names = ", ".join(sorted(expected))
-            cure = f"correct the materials in dataset.yaml (there {names}), or the labels of the mask"
-            raise InputError(fault, file=path, key=f"{key}[{members[0]}].materials", cure=cure)
 
 
 def describe_specks(inside: Bool[np.ndarray, "h w"]) -> str:
@@ -196,34 +198,36 @@ def describe_specks(inside: Bool[np.ndarray, "h w"]) -> str:
 
 def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:
     """Convert the values of a label PNG to labels; InputError for an unknown value."""
-    present, counts = np.unique(values, return_counts=True)
-    if set(present.tolist()) <= {0, LEFT_OUT} and LEFT_OUT in present:
+    counts = np.bincount(values.ravel())
+    present = set(np.flatnonzero(counts).tolist())
+    if LEFT_OUT in present <= {0, LEFT_OUT}:
         cure = f"if 255 means inside, write masks: {{{materials[0]}: <this file>}}: in a label mask it means leave out"
         raise InputError("the mask is empty: it holds only 0 and 255", file=path, key=key, cure=cure)
-    for value, count in zip(present.tolist(), counts.tolist()):
-        if value > len(materials) and value != LEFT_OUT:
-            known = ", ".join(f"{k} {name}" for k, name in enumerate(materials, 1))
-            raise InputError(
-                f"unknown label {value} ({count} pixels)",
-                file=path,
-                key=key,
-                cure=f"known are: 0 background, {known}, 255 leave out",
-            )
+    if unknown := present - {*range(len(materials) + 1), LEFT_OUT}:
+        known = ", ".join(f"{k} {name}" for k, name in enumerate(materials, 1))
+        raise InputError(
+            f"unknown label {min(unknown)} ({counts[min(unknown)]} pixels)",
+            file=path,
+            key=key,
+            cure=f"known are: 0 background, {known}, 255 leave out",
+        )
     left_out = values == LEFT_OUT
     return Labels(label=np.where(left_out, 0, values).astype(np.uint8), left_out=left_out)
 
 
 def _merged(
-    inside: Mapping[str, np.ndarray], materials: list[str], sources: Mapping[str, tuple[Path, str]], edge: int
-) -> Labels | None:
-    """Merge several masks into one map; None if there are none.
+    inside: Mapping[str, np.ndarray],
+    materials: list[str],
+    sources: Mapping[str, tuple[Path, str]],
+    size: tuple[int, int],
+    edge: int,
+) -> Labels:
+    """Merge masks of materials into one map.
 
     Pixels that two masks claim are left out; if they are wider than `edge` pixels, InputError is raised. Where outlines
     are drawn (`edge` > 0), a mask that lies wholly in another is in front of it.
     """
-    if not inside:
-        return None
-    label = np.zeros(next(iter(inside.values())).shape, dtype=np.uint8)
+    label = np.zeros(size, dtype=np.uint8)
     left_out = label > 0
     numbers = [(k, name) for k, name in enumerate(materials, 1) if name in inside]
     for number, material in sorted(numbers, key=lambda each: -int(inside[each[1]].sum()) if edge else 0):
@@ -233,12 +237,11 @@ def _merged(
             other_path = sources[materials[claimed - 1]][0]
             fault = f"materials {materials[claimed - 1]!r} and {material!r} share {int(shared.sum())} pixels"
             fault += f" with {other_path.name}" if other_path != path else ""
-            square = (edge + 1, edge + 1)
             within = (shared == inside[material]).all() and shared.sum() < inside[materials[claimed - 1]].sum()
             if edge and within:  # drawn on a larger one, whose outline does not spare it
                 log.warning("%s: %s: %s: %r is in front", path, key, fault, material)
                 continue
-            if min(shared.shape) > edge and sliding_window_view(shared, square).all((2, 3)).any():
+            if min(shared.shape) > edge and sliding_window_view(shared, (edge + 1, edge + 1)).all((2, 3)).any():
                 raise InputError(
                     fault, file=path, key=key, cure="a pixel shows one material: erase it from the one behind"
                 )

@@ -34,10 +34,8 @@ from factorlib.reading import check_plain, one_line, read_bytes, read_text, read
 
 FORMATS = ["PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "TGA"]  # Pillow's names
 MODES = ("1", "L", "P", "LA", "RGB", "RGBA", "I;16", "I;16B")  # Pillow's modes whose values are read as they are
-LOSSY = ("jpeg", "tiff_jpeg", "webp")  # compressions of a TIFF
 RINGING = 32  # greatest error of a lossy format, codes
 MOST_SOFT = 0.25  # greatest share of pixels between black and white in a lossy silhouette, of the white ones
-_STRETCH = {"L;2": 85, "L;4": 17}  # code of 1 after grey of so many bits is stretched to 8
 Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; a mask has the size of its photo, which is limited
 OVERSHOOT = 2.0  # a polygon may leave the image by this many pixels
 MOST_BYTES = 512_000_000  # greatest size of a file; a hundred thousand outlines take half of it
@@ -50,7 +48,6 @@ CHANGED = re.compile(r"^[0-9a-f]{8}-|\.rf\.[0-9a-f]{32}\.\w+$")  # what Label St
 SHAPES = ("polygon", "rectangle", "rotation", "mask")  # shapes of labelme and X-AnyLabeling that have an area
 CURE = "export the file again"
 log = logging.getLogger("factorlib.labels")
-SIMPLER = "draw outlines with fewer corners, or export the file again"
 
 
 def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None) -> UInt16[np.ndarray, "h w"]:
@@ -106,7 +103,7 @@ def read_labels_in(path: str | Path, key: str, size: tuple[int, int] | None = No
     if picture.opaque is not None and (picture.pixels.ndim == 3 or picture.pixels.max() > LARGEST_LABEL):
         return set()
     values = _exact_values(picture, path, key)
-    present = set(np.unique(values).tolist()) - {0, LEFT_OUT}
+    present = set(np.flatnonzero(np.bincount(values.ravel())).tolist()) - {0, LEFT_OUT}
     bright = 2 * np.count_nonzero(values > LEFT_OUT // 2) >= np.count_nonzero(values)
     is_matte = bright and max(present, default=0) > LARGEST_LABEL
     return set() if is_matte else {label for label in present if label < LEFT_OUT}
@@ -143,9 +140,12 @@ def read_colours(
     for colour in np.unique(colours).tolist():
         name = names.get(colour)
         if name != BACKGROUND and name not in materials:
-            fault = f"has the colour #{colour:06x}, which {labelmap.name} calls {name!r}: not a material"
-            cure = f"give {labelmap.name} a line for it, with one of {', '.join(materials)}, or {BACKGROUND}"
-            raise InputError(fault, file=path, key=key, cure=cure)
+            raise InputError(
+                f"has the colour #{colour:06x}, which {labelmap.name} calls {name!r}: not a material",
+                file=path,
+                key=key,
+                cure=f"give {labelmap.name} a line for it, with one of {', '.join(materials)}, or {BACKGROUND}",
+            )
         labels[colours == colour] = 0 if name == BACKGROUND else materials.index(name) + 1
     return labels
 
@@ -193,7 +193,7 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
                 cure="save one picture of 8 or 16 bits, as PNG",
             )
         raw = re.search(r"\b(L|LA|RGB|RGBA);\d+", str(image.tile))
-        lossy = image.format == "JPEG" or image.info.get("compression") in LOSSY
+        lossy = image.format == "JPEG" or image.info.get("compression") in ("jpeg", "tiff_jpeg", "webp")
         lossy |= image.format == "WEBP" and b"VP8L" not in Path(path).read_bytes()[: 1 << 16]
         ImageOps.exif_transpose(image, in_place=True)
         check_size(image.size[::-1], size, path, key)
@@ -222,24 +222,25 @@ def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.nd
 
 def _values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
     """Return the stored values of a decoded picture; InputError for colours and transparency."""
-    fault = None
     values = picture.pixels
-    if values.ndim == 3 and ";16" in picture.raw:  # Pillow keeps only the upper byte
-        fault = "has several channels of 16 bits"
-        cure = "save labels in one channel of 8 bits"
-    elif values.ndim == 3:
+    if values.ndim == 3:
+        if ";16" in picture.raw:  # Pillow keeps only the upper byte
+            cure = "save labels in one channel of 8 bits"
+            raise InputError("has several channels of 16 bits", file=path, key=key, cure=cure)
+        if picture.opaque is not None:
+            cure = "save it without alpha: 0 is background; or, if it shows one material, write masks: {material: file}"
+            raise InputError("has transparent pixels", file=path, key=key, cure=cure)
         colours = values[..., : 1 if values.shape[-1] == 2 else 3]
         coloured = np.ptp(colours, axis=-1) > (RINGING if picture.lossy else 0)
-        if picture.opaque is not None:
-            fault = "has transparent pixels"
-            cure = "save it without alpha: 0 is background; or, if it shows one material, write masks: {material: file}"
-        elif coloured.any():
-            fault = f"is a colour picture (one pixel is {tuple(colours[coloured][0].tolist())})"
-            cure = "save labels in one channel: 0 background, k for the k-th material, 255 leave out"
+        if coloured.any():
+            raise InputError(
+                f"is a colour picture (one pixel is {tuple(colours[coloured][0].tolist())})",
+                file=path,
+                key=key,
+                cure="save labels in one channel: 0 background, k for the k-th material, 255 leave out",
+            )
         values = colours[..., 0]
-    if fault:
-        raise InputError(fault, file=path, key=key, cure=cure)
-    return (values // _STRETCH.get(picture.raw, 1)).astype(np.uint16)
+    return (values // {"L;2": 85, "L;4": 17}.get(picture.raw, 1)).astype(np.uint16)  # the code of 1 in stretched grey
 
 
 def check_size(size: Sequence[float], expected: Sequence[int], path: str | Path, key: str) -> None:
@@ -255,14 +256,13 @@ def check_size(size: Sequence[float], expected: Sequence[int], path: str | Path,
         InputError: If they differ.
     """
     if tuple(size) != tuple(expected):
-        cure = "save the mask with the photo's own pixels"
-        if tuple(size) == tuple(expected)[::-1]:
-            cure = "it lies on its side: the photo's EXIF orientation is applied, so mask the photo as it is displayed"
         raise InputError(
             f"the mask is {size[1]:g} × {size[0]:g} pixels, the photo {expected[1]} × {expected[0]}",
             file=path,
             key=key,
-            cure=cure,
+            cure="it lies on its side: the photo's EXIF orientation is applied, so mask the photo as it is displayed"
+            if tuple(size) == tuple(expected)[::-1]
+            else "save the mask with the photo's own pixels",
         )
 
 
@@ -356,10 +356,10 @@ def read_annotations(path: str | Path, image: str = "", key: str | None = None) 
             return msgspec.json.decode(content, type=Coco)
         images = [CocoImage(0, image, labelme.imageWidth, labelme.imageHeight)]
         names = dict.fromkeys(shape.label for shape in labelme.shapes)
-        for k, kind in enumerate(shape.shape_type for shape in labelme.shapes):
-            if kind not in SHAPES:
+        for k, shape in enumerate(labelme.shapes):
+            if shape.shape_type not in SHAPES:
                 raise InputError(
-                    f"{one_line(repr(kind))} is not read, but {', '.join(SHAPES)} are",
+                    f"{one_line(repr(shape.shape_type))} is not read, but {', '.join(SHAPES)} are",
                     file=path,
                     key=f"shapes[{k}].shape_type",
                     cure="draw its outline, or delete it",
@@ -374,8 +374,7 @@ def _segmentation(shape: LabelmeShape) -> bytes:
         return msgspec.json.encode(Rle(mask=shape.mask or b"", points=shape.points))
     points = np.array(shape.points)
     if shape.shape_type == "rectangle":  # two opposite corners, or all four
-        (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
-        points = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        points = np.where([[0, 0], [1, 0], [1, 1], [0, 1]], points.max(axis=0), points.min(axis=0))
     return msgspec.json.encode([points.ravel().tolist()])
 
 
@@ -419,9 +418,12 @@ def read_coco(
             fault = f"category_id is {annotation.category_id!r}, but categories has no such id"
             raise InputError(fault, file=path, key=f"annotations[{index}]", cure="add it, or correct category_id")
         if name not in materials:
-            cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
-            fault = f"category {name!r} is not a material"
-            raise InputError(fault, file=path, key=place.partition(".")[0], cure=cure)
+            raise InputError(
+                f"category {name!r} is not a material",
+                file=path,
+                key=place.partition(".")[0],
+                cure=did_you_mean(name, materials) + " (categories are the dataset's materials)",
+            )
         segmentations.setdefault(name, []).append((place, annotation.segmentation))
     masks = {}
     length = 0.0  # of all outlines
@@ -431,23 +433,31 @@ def read_coco(
             runs, longer = _shapes(segmentation, size, path, place)
             shapes += [(place, counts) for counts in runs]
             length += longer
-            if length > (most := LONGEST_TOGETHER * sum(size)):
-                fault = f"all outlines together are {length:.3g} pixels long; at most {most:,} are read"
-                raise InputError(fault, file=path, key=place, cure=SIMPLER)
+            _check_length(length, LONGEST_TOGETHER, "all outlines together are", size, path, place)
         masks[name] = _union(shapes, size, path)
     return masks
 
 
+def _check_length(length: float, most: int, words: str, size: tuple[int, int], path: str | Path, key: str) -> None:
+    """Check the length of outlines against `most` half perimeters of the photo."""
+    if length > most * sum(size):
+        raise InputError(
+            f"{words} {length:.3g} pixels long; at most {most * sum(size):,} are read",
+            file=path,
+            key=key,
+            cure="draw outlines with fewer corners, or export the file again",
+        )
+
+
 def _check_stated_size(coco: Coco, entry: CocoImage, size: tuple[int, int], path: str | Path, key: str) -> None:
     """Check the size that a file states; that of a photo on its side may be the stored one, which an outline leaves."""
-    height = entry.height or size[0]
-    width = entry.width or size[1]
-    if (height, width) == size[::-1] != size:
+    height, width = stated = (entry.height or size[0], entry.width or size[1])
+    if stated == size[::-1] != size:
         shapes = [bytes(shape.segmentation) for shape in coco.annotations if shape.image_id == entry.id]
         outlines = [outline for text in shapes if text[:1] == b"[" for outline in msgspec.json.decode(text)]
         if any(max(each[::2], default=0) > width or max(each[1::2], default=0) > height for each in outlines):
             return
-    check_size((height, width), size, path, key)
+    check_size(stated, size, path, key)
 
 
 def _union(
@@ -504,19 +514,12 @@ def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
     same = same or [path for path in places if CHANGED.sub("", path.name) in (base, plain)]
     nearest = nearest_paths(place, same)
     entries = [entry for entry, path in zip(coco.images, places) if path in nearest]
-    if not entries:
+    if len(entries) != 1:
         raise InputError(
-            f"the COCO file has no image {base!r}",
+            f"the file has {len(entries) or 'no'} image{'s' * (len(entries) > 1)} {base!r}",
             file=path,
             key="images",
-            cure=did_you_mean(base, [path.name for path in places]),
-        )
-    if len(entries) > 1:
-        raise InputError(
-            f"has {len(entries)} images {base!r}",
-            file=path,
-            key="images",
-            cure=f"keep one, or call one {image!r}",
+            cure=f"keep one, or call one {image!r}" if entries else did_you_mean(base, [path.name for path in places]),
         )
     return entries[0]
 
@@ -544,25 +547,22 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
     length = 0.0
     limit = np.array(shape[::-1])
     for index, polygon in enumerate(segmentation):
-        fault = ""
+        place = f"{key}[{index}]"
         corners = np.array(polygon)
         if len(corners) in (0, 2, 4):
-            log.warning("%s: %s[%d]: fewer than three corners: it counts as empty", path, key, index)
+            log.warning("%s: %s: fewer than three corners: it counts as empty", path, place)
             continue
-        cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
         if len(corners) % 2 or not np.isfinite(corners).all():
-            fault = "is not a polygon"
-        elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
+            cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
+            raise InputError("is not a polygon", file=path, key=place, cure=cure)
+        corners = corners.reshape(-1, 2)
+        if (corners < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
             fault = f"has corners outside the image of {shape[1]} × {shape[0]} pixels"
             cure = "clip it to the image; if it was drawn at another size, export it at the photo's own size"
-        else:
-            corners = np.clip(corners, 0, limit)
-            longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
-            if longer > LONGEST * sum(shape):
-                fault = f"its outline is {longer:.3g} pixels long; at most {LONGEST * sum(shape):,} are read"
-                cure = SIMPLER
-        if fault:
-            raise InputError(fault, file=path, key=f"{key}[{index}]", cure=cure)
+            raise InputError(fault, file=path, key=place, cure=cure)
+        corners = np.clip(corners, 0, limit)
+        longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
+        _check_length(longer, LONGEST, "its outline is", shape, path, place)
         polygons.append(corners.ravel().tolist())
         length += longer
     runs = pycocomask.frPyObjects(polygons, *shape) if polygons else []
