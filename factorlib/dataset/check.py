@@ -15,6 +15,7 @@ from factorlib.dataset.schema import (
     CameraSource,
     DatasetFile,
     GroundEntry,
+    KnownMaterial,
     MeshEntry,
     MeshInstance,
     MirrorBall,
@@ -50,35 +51,29 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     """Check dataset.yaml for consistency; InputError names file, key and cure of each fault."""
     refuse = Refusal(file, file.parent)
     for index, name in enumerate(spec.materials):
-        if name in spec.materials[:index]:
-            with refuse.collect_fault():
-                refuse(
-                    f"materials[{index}]",
-                    f"material {name!r} is named twice",
-                    "label k is the k-th material: name each once",
-                )
+        refuse.collect(
+            refuse.refuse_if,
+            name in spec.materials[:index],
+            f"materials[{index}]",
+            f"material {name!r} is named twice",
+            "label k is the k-th material: name each once",
+        )
     for name, mesh in spec.meshes.items():
-        with refuse.collect_fault():
-            _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
-            if mesh.hull and spec.cameras is None:
-                _check_hull(name, spec, refuse)
-    with refuse.collect_fault():
-        refuse.check_distinct("photos", (photo.name for photo in spec.photos), "photo")
+        refuse.collect(_check_mesh, name, mesh, spec, refuse)
+    refuse.collect(refuse.check_distinct, "photos", (photo.name for photo in spec.photos), "photo")
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
-    with refuse.collect_fault():
-        refuse.refuse_if(
-            all(photo.held_out for photo in spec.photos),
-            "photos",
-            "every photo is held out, so that none is left to solve from",
-            "leave held_out out of at least one photo",
-        )
-    with refuse.collect_fault():
-        if spec.cameras is not None:
-            _check_source(spec.cameras, spec, refuse)
-    with refuse.collect_fault():
-        if spec.truth is not None:
-            refuse.check_path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
+    refuse.collect(
+        refuse.refuse_if,
+        all(photo.held_out for photo in spec.photos),
+        "photos",
+        "every photo is held out, so that none is left to solve from",
+        "leave held_out out of at least one photo",
+    )
+    if spec.cameras is not None:
+        refuse.collect(_check_source, spec.cameras, spec, refuse)
+    if spec.truth is not None:
+        refuse.collect(refuse.check_path, "truth", spec.truth, (".yaml", ".yml"), False)
     raise_all(refuse.faults)
     _check_known(spec, refuse)  # requires valid objects and meshes
     raise_all(refuse.faults)
@@ -98,11 +93,13 @@ def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -
     """
     refuse = Refusal(file, folder)
     photos = {photo.name: photo for photo in spec.photos}
-    lights = {photo.light for photo in spec.photos}
     for name in truth.materials:
         refuse.check_known(f"materials.{name}", name, spec.materials, "material")
-    groups = {"illumination": (lights, "illumination"), "normals": (photos, "photo"), "albedo": (photos, "photo")}
-    for group, (known, kind) in groups.items():
+    for group, known, kind in (
+        ("illumination", {photo.light for photo in spec.photos}, "illumination"),
+        ("normals", photos, "photo"),
+        ("albedo", photos, "photo"),
+    ):
         for name, path in getattr(truth, group).items():
             refuse.check_known(f"{group}.{name}", name, known, kind)
             refuse.check_path(f"{group}.{name}", path, MAPS, must_exist=False)
@@ -118,16 +115,17 @@ def check_lights(photos: list[PhotoEntry], file: Path) -> None:
     first: dict[str, PhotoEntry] = {}
     for index, photo in enumerate(photos):
         first_photo = first.setdefault(photo.light, photo)
-        if (first_photo.world_from_camera is None) != (photo.world_from_camera is None):
-            names = f"{first_photo.name!r} and {photo.name!r}"
-            Refusal(file, file.parent)(
-                f"photos[{index}].world_from_camera",
-                f"photos {names} share illumination {photo.light!r}, but only one of them has this key",
-                "give it for every photo that shares a light fixed to the world, or for none (fixed to the camera)",
-            )
+        Refusal(file, file.parent).refuse_if(
+            (first_photo.world_from_camera is None) != (photo.world_from_camera is None),
+            f"photos[{index}].world_from_camera",
+            f"photos {first_photo.name!r} and {photo.name!r} share illumination {photo.light!r}, "
+            "but only one of them has this key",
+            "give it for every photo that shares a light fixed to the world, or for none (fixed to the camera)",
+        )
 
 
-def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
+def _check_mesh(name: str, mesh: MeshEntry, spec: DatasetFile, refuse: Refusal) -> None:
+    key = f"meshes.{name}"
     kinds = [kind for kind in ("file", "hull", "lathe", "primitive") if getattr(mesh, kind)]
     refuse.refuse_if(
         len(kinds) != 1,
@@ -149,23 +147,20 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
         f"cannot be combined with {kinds[0]}, which has one part",
         "write `material: …` instead",
     )
-    if mesh.parts and mesh.material is not None:
-        refuse(
-            key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material: …` for all of it"
-        )
-    if not mesh.parts and mesh.material is None:
-        refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
+    refuse.refuse_if(
+        bool(mesh.parts) == (mesh.material is not None),
+        key,
+        f"has {'both parts and' if mesh.parts else 'neither parts nor'} a material",
+        "give either `parts: {part: material, …}`, or `material: …` for all of it",
+    )
     if mesh.material is not None:
-        refuse.check_known(f"{key}.material", mesh.material, materials, "material")
-    _check_parts(f"{key}.parts", mesh.parts or {}, mesh, materials, refuse)
-
-
-def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
+        refuse.check_known(f"{key}.material", mesh.material, spec.materials, "material")
+    _check_parts(f"{key}.parts", mesh.parts or {}, mesh, spec.materials, refuse)
     instances = [obj for photo in spec.photos for obj in photo.objects if obj.mesh == name]
     known = sum(obj.pose is not None for obj in instances)
     refuse.refuse_if(
-        known < LEAST_OUTLINES,
-        f"meshes.{name}.hull",
+        mesh.hull and spec.cameras is None and known < LEAST_OUTLINES,
+        f"{key}.hull",
         f"{known} of the {len(instances)} photos of it have a known camera; a hull needs at least two",
         "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive",
     )
@@ -193,50 +188,52 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
 
 
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
-    with refuse.collect_fault():
-        refuse.refuse_if(
-            photo.name in RESERVED_PHOTOS,
-            f"{key}.name",
-            f"the name {photo.name!r} is reserved for a file of the results",
-            "rename the photo",
-        )
-    with refuse.collect_fault():
-        refuse.check_path(f"{key}.image", photo.image, IMAGES)
-    with refuse.collect_fault():
-        if photo.world_from_camera is not None:
-            refuse.check_rotation(f"{key}.world_from_camera", photo.world_from_camera)
-    with refuse.collect_fault():
-        if photo.ground is not None:
-            _check_ground(f"{key}.ground.normal", photo.ground, refuse)
-    with refuse.collect_fault():
-        if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
-            refuse(
-                f"{key}.camera.distortion",
-                "its unit is the focal length, which is not given",
-                "give focal_px beside it",
-            )
-    with refuse.collect_fault():
-        if not photo.masks:
-            refuse(f"{key}.masks", "no mask is named", "give a label PNG, a COCO json, or {material: mask.png, …}")
-        if isinstance(photo.masks, str):
-            refuse.check_path(f"{key}.masks", photo.masks, MASKS)
-            companion = labelmap_beside(photo.masks, refuse.folder) or photo.masks
-            refuse.check_path(f"{key}.masks", companion, (*MASKS, ".txt"))
+    refuse.collect(
+        refuse.refuse_if,
+        photo.name in RESERVED_PHOTOS,
+        f"{key}.name",
+        f"the name {photo.name!r} is reserved for a file of the results",
+        "rename the photo",
+    )
+    refuse.collect(refuse.check_path, f"{key}.image", photo.image, IMAGES)
+    if photo.world_from_camera is not None:
+        refuse.collect(refuse.check_rotation, f"{key}.world_from_camera", photo.world_from_camera)
+    if photo.ground is not None:
+        refuse.collect(_check_ground, f"{key}.ground.normal", photo.ground, refuse)
+    refuse.collect(
+        refuse.refuse_if,
+        photo.camera and photo.camera.distortion and photo.camera.focal_px is None,
+        f"{key}.camera.distortion",
+        "its unit is the focal length, which is not given",
+        "give focal_px beside it",
+    )
+    refuse.collect(
+        refuse.refuse_if,
+        not photo.masks,
+        f"{key}.masks",
+        "no mask is named",
+        "give a label PNG, a COCO json, or {material: mask.png, …}",
+    )
+    if isinstance(photo.masks, str) and photo.masks:
+        refuse.collect(_check_label_mask, f"{key}.masks", photo.masks, refuse)
     for material, path in {} if isinstance(photo.masks, str) else photo.masks.items():
-        with refuse.collect_fault():
-            refuse.check_known(f"{key}.masks.{material}", material, spec.materials, "material")
-            refuse.check_path(f"{key}.masks.{material}", path, MASK_IMAGES)
-    with refuse.collect_fault():
-        refuse.refuse_if(
-            not photo.objects,
-            f"{key}.objects",
-            f"photo {photo.name!r} has no objects",
-            "add {name: …, mesh: …}: a mesh gives its pixels their normals",
-        )
-        refuse.check_distinct(f"{key}.objects", (obj.name for obj in photo.objects), "object")
+        refuse.collect(refuse.check_known, f"{key}.masks.{material}", material, spec.materials, "material")
+        refuse.collect(refuse.check_path, f"{key}.masks.{material}", path, MASK_IMAGES)
+    refuse.collect(
+        refuse.refuse_if,
+        not photo.objects,
+        f"{key}.objects",
+        f"photo {photo.name!r} has no objects",
+        "add {name: …, mesh: …}: a mesh gives its pixels their normals",
+    )
+    refuse.collect(refuse.check_distinct, f"{key}.objects", (obj.name for obj in photo.objects), "object")
     for index, obj in enumerate(photo.objects):
-        with refuse.collect_fault():
-            _check_object(f"{key}.objects[{index}]", obj, spec, refuse)
+        refuse.collect(_check_object, f"{key}.objects[{index}]", obj, spec, refuse)
+
+
+def _check_label_mask(key: str, masks: str, refuse: Refusal) -> None:
+    refuse.check_path(key, masks, MASKS)
+    refuse.check_path(key, labelmap_beside(masks, refuse.folder) or masks, (*MASKS, ".txt"))
 
 
 def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusal) -> None:
@@ -259,13 +256,13 @@ def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusa
             f"cannot be combined with meshes.{obj.mesh}.size: the pose determines the size",
             "keep one of the two",
         )
-    refuse.refuse_if(
-        obj.keypoints and not mesh.file,
-        f"{key}.keypoints",
-        "its mesh has no file, so no points are known on it",
-        "leave them out, or give the mesh's file",
-    )
     if obj.keypoints:
+        refuse.refuse_if(
+            not mesh.file,
+            f"{key}.keypoints",
+            "its mesh has no file, so no points are known on it",
+            "leave them out, or give the mesh's file",
+        )
         _check_keypoints(f"{key}.keypoints", obj, refuse)
 
 
@@ -273,83 +270,102 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
     """Check that known materials occur on objects, and reflect some light but no more than arrives."""
     used = {m for photo in spec.photos for obj in photo.objects for m in instance_materials(obj, spec)}
     for name, reflectance in spec.known.materials.items():
-        with refuse.collect_fault():
-            key = f"known.materials.{name}"
-            refuse.check_known(key, name, spec.materials, "material")
-            refuse.refuse_if(
-                name not in used,
-                key,
-                f"no object is made of material {name!r}",
-                "leave it out, or add the object that shows it",
-            )
-            if reflectance.diffuse is None:
-                refuse.refuse_if(
-                    not reflectance.kind or bool(reflectance.specular or reflectance.roughness),
-                    key,
-                    "its diffuse reflectance is missing",
-                    "give `diffuse: [r, g, b]`, or `kind` alone",
-                )
-                continue
-            specular = reflectance.specular or (0.0, 0.0, 0.0)
-            refuse.refuse_if(
-                not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0,
-                key,
-                "it reflects nothing in some channel, so that the light cannot be derived from it",
-                "give what it reflects in every channel, or leave it out",
-            )
-            refuse.refuse_if(
-                max(reflectance.diffuse) + max(specular) > 1,
-                key,
-                f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together",
-                "their largest channels may be 1 together: no more light is reflected than falls on it",
-            )
-    _check_known_lights(spec, refuse)
+        refuse.collect(_check_known_material, name, reflectance, used, spec, refuse)
+    for name in spec.known.exposure:
+        refuse.collect(_check_exposure, name, spec, refuse)
+    for name, light in spec.known.illumination.items():
+        refuse.collect(_check_known_light, name, light, spec, refuse)
 
 
-def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
-    """Check known exposures, maps and mirror balls.
+def _check_known_material(
+    name: str, reflectance: KnownMaterial, used: set[str], spec: DatasetFile, refuse: Refusal
+) -> None:
+    key = f"known.materials.{name}"
+    specular = reflectance.specular or (0.0, 0.0, 0.0)
+    refuse.check_known(key, name, spec.materials, "material")
+    refuse.refuse_if(
+        name not in used,
+        key,
+        f"no object is made of material {name!r}",
+        "leave it out, or add the object that shows it",
+    )
+    if reflectance.diffuse is None:
+        refuse.refuse_if(
+            not reflectance.kind or reflectance.specular or reflectance.roughness,
+            key,
+            "its diffuse reflectance is missing",
+            "give `diffuse: [r, g, b]`, or `kind` alone",
+        )
+        return
+    refuse.refuse_if(
+        not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0,
+        key,
+        "it reflects nothing in some channel, so that the light cannot be derived from it",
+        "give what it reflects in every channel, or leave it out",
+    )
+    refuse.refuse_if(
+        max(reflectance.diffuse) + max(specular) > 1,
+        key,
+        f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together",
+        "their largest channels may be 1 together: no more light is reflected than falls on it",
+    )
+
+
+def _check_exposure(name: str, spec: DatasetFile, refuse: Refusal) -> None:
+    key = f"known.exposure.{name}"
+    lights = {photo.name: photo.light for photo in spec.photos}
+    refuse.check_known(key, name, lights, "photo")
+    without = next((p for p in lights if lights[p] == lights[name] and p not in spec.known.exposure), None)
+    refuse.refuse_if(
+        without,
+        key,
+        f"photo {without!r}, of the same light, has none",
+        "give all of them an EV, or none",
+    )
+
+
+def _check_known_light(name: str, light: str | MirrorBall, spec: DatasetFile, refuse: Refusal) -> None:
+    """Check a known map or mirror ball.
 
     A mirror ball is an object of the light.  It consists of one known material that nothing else in the photo has.
     """
-    shots: dict[str, list[PhotoEntry]] = {}
-    for photo in spec.photos:
-        shots.setdefault(photo.light, []).append(photo)
-    for name in spec.known.exposure:
-        with refuse.collect_fault():
-            key = f"known.exposure.{name}"
-            refuse.check_known(key, name, [photo.name for photo in spec.photos], "photo")
-            sharing = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
-            if without := [photo.name for photo in sharing if photo.name not in spec.known.exposure]:
-                refuse(key, f"photo {without[0]!r}, of the same light, has none", "give all of them an EV, or none")
-    for name, light in spec.known.illumination.items():
-        with refuse.collect_fault():
-            key = f"known.illumination.{name}"
-            refuse.check_known(key, name, shots, "illumination")
-            if isinstance(light, str):
-                refuse.check_path(key, light, MAPS)
-                continue
-            key = f"{key}.chrome"
-            if not (balls := list(mirror_balls(spec, name, light))):
-                names = [obj.name for photo in shots[name] for obj in photo.objects]
-                refuse.check_known(key, light.chrome, names, "object")
-            photo, ball = balls[0]
-            material = min(instance_materials(ball, spec))
-            mesh = spec.meshes[ball.mesh]
-            if len(instance_materials(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
-                refuse(key, f"mesh {ball.mesh!r} is not a ball of one material", "give a file, or `primitive: ball`")
-            if any(material in instance_materials(obj, spec) for obj in photo.objects if obj is not ball):
-                cure = "give the ball a material of its own"
-                refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)
-            known = spec.known.materials.get(material)
-            if known is None or known.diffuse is None or any(known.diffuse) or not known.specular:
-                cure = (
-                    f"write known.materials.{material}: "
-                    "{diffuse: [0, 0, 0], specular: [0.55, 0.55, 0.55]}, as chrome's is"
-                )
-                refuse(key, f"the specular reflectance of {material!r} is not known, or it is not a mirror", cure)
-            if len(shots[name]) > 1 and photo.name not in spec.known.exposure:
-                cure = "give known.exposure of these photos, or give the ball's photo a light of its own"
-                refuse(key, f"{len(shots[name])} photos of unknown exposure share the light of the ball", cure)
+    key = f"known.illumination.{name}"
+    sharing = [photo for photo in spec.photos if photo.light == name]
+    refuse.check_known(key, name, [photo.light for photo in spec.photos], "illumination")
+    if isinstance(light, str):
+        return refuse.check_path(key, light, MAPS)
+    key += ".chrome"
+    names = [obj.name for photo in sharing for obj in photo.objects]
+    refuse.check_known(key, light.chrome, names, "object")
+    photo, ball = next(mirror_balls(spec, name, light))
+    materials = instance_materials(ball, spec)
+    material = min(materials)
+    mesh = spec.meshes[ball.mesh]
+    known = spec.known.materials.get(material)
+    refuse.refuse_if(
+        len(materials) > 1 or not (mesh.file or mesh.primitive == "ball"),
+        key,
+        f"mesh {ball.mesh!r} is not a ball of one material",
+        "give a file, or `primitive: ball`",
+    )
+    refuse.refuse_if(
+        any(material in instance_materials(obj, spec) for obj in photo.objects if obj is not ball),
+        key,
+        f"another object of photo {photo.name!r} is made of {material!r} too",
+        "give the ball a material of its own",
+    )
+    refuse.refuse_if(
+        known is None or known.diffuse is None or any(known.diffuse) or not known.specular,
+        key,
+        f"the specular reflectance of {material!r} is not known, or it is not a mirror",
+        f"write known.materials.{material}: {{diffuse: [0, 0, 0], specular: [0.55, 0.55, 0.55]}}, as chrome's is",
+    )
+    refuse.refuse_if(
+        len(sharing) > 1 and photo.name not in spec.known.exposure,
+        key,
+        f"{len(sharing)} photos of unknown exposure share the light of the ball",
+        "give known.exposure of these photos, or give the ball's photo a light of its own",
+    )
 
 
 def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, MeshInstance]]:
@@ -392,12 +408,12 @@ def _check_ground(key: str, ground: GroundEntry, refuse: Refusal) -> None:
 
 def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
     """Check that keypoints are enough, distinct, and not collinear, which would leave a rotation free."""
-    if obj.pose is not None:
-        refuse(
-            key,
-            "has both a pose and keypoints",
-            "keep one: a pose is used as it is, keypoints are where the search begins",
-        )
+    refuse.refuse_if(
+        obj.pose is not None,
+        key,
+        "has both a pose and keypoints",
+        "keep one: a pose is used as it is, keypoints are where the search begins",
+    )
     refuse.refuse_if(
         len(obj.keypoints) < LEAST_KEYPOINTS,
         key,
@@ -408,8 +424,12 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         places = [getattr(keypoint, name) for keypoint in obj.keypoints]
         first: dict[tuple[float, ...], int] = {}
         for index, place in enumerate(places):
-            if (first_index := first.setdefault(place, index)) != index:
-                refuse(f"{key}[{index}].{name}", f"equals that of {key}[{first_index}]", "name each place once")
+            refuse.refuse_if(
+                first.setdefault(place, index) != index,
+                f"{key}[{index}].{name}",
+                f"equals that of {key}[{first[place]}]",
+                "name each place once",
+            )
         # largest distance of a place from the line through the first and the farthest one
         arms = [[x - x0 for x, x0 in zip(place, places[0])] for place in places[1:]]
         longest = max(arms, key=lambda arm: math.hypot(*arm))
@@ -446,10 +466,11 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
         refuse.check_path("cameras.transforms", source.transforms or "", (".json",))
     elif kind != "sfm":
         refuse.check_subfolder(f"cameras.{kind}", getattr(source, kind))
-    photos = [photo.name for photo in spec.photos]
-    objects = {obj.name for photo in spec.photos for obj in photo.objects}
-    keys = {"images": (photos, "photo"), "world_from_object": (objects, "object"), "obj_ids": (spec.meshes, "mesh")}
-    for key, (known, noun) in keys.items():
+    for key, known, noun in (
+        ("images", [photo.name for photo in spec.photos], "photo"),
+        ("world_from_object", {obj.name for photo in spec.photos for obj in photo.objects}, "object"),
+        ("obj_ids", spec.meshes, "mesh"),
+    ):
         for name in getattr(source, key):
             refuse.check_known(f"cameras.{key}.{name}", name, known, noun)
     for name, similarity in source.world_from_object.items():

@@ -6,10 +6,9 @@ Links are followed before a path is checked.
 import os
 import stat
 import unicodedata
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePath, PurePosixPath
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain, path_inside, reading
@@ -77,11 +76,10 @@ class Refusal:
         if condition:
             self(key, fault, cure)
 
-    @contextmanager
-    def collect_fault(self) -> Iterator[None]:
-        """Catch an InputError of the code inside and add it to `faults`, so that checking continues."""
+    def collect(self, check: Callable[..., None], *arguments: Any) -> None:
+        """Call a check, and add its InputError, if any, to `faults`, so that checking continues."""
         try:
-            yield
+            check(*arguments)
         except InputError as error:
             self.faults.append(error)
 
