@@ -55,8 +55,9 @@ def read_dataset(path: str | Path) -> Dataset:
     raise_all(faults)
     external: dict[str, ExternalCamera] = {}
     refuse = Refusal(file, file.parent)
-    files = {name: mesh.file for name, mesh in spec.meshes.items() if mesh.file}
-    companions = {name: _companions(path, f"meshes.{name}.file", refuse) for name, path in files.items()}
+    companions = {
+        name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items() if mesh.file
+    }
     if spec.cameras is not None and not spec.cameras.sfm:
         from factorlib.dataset.sources.external_cameras import external_cameras
 
@@ -105,21 +106,14 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     if file.is_symlink() and not Path(os.path.realpath(file)).is_relative_to(os.path.realpath(file.parent)):
         raise InputError("is a link that leads outside the dataset", file=file, cure="put the file itself there")
     text = read_text(file, "a YAML file", most_bytes=MOST_BYTES)
-    value = parse_yaml(text, file)
     places: list[str] = []
-    value = _fill_placeholders(value, "", places, file.parent)
+    value = _fill_placeholders(parse_yaml(text, file), "", places, file.parent)
     faults = []
     if places:
-        fault = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
-        hint = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
-        faults.append(
-            InputError(
-                f"{fault}: {_enumerate(places)}",
-                file=file,
-                key=places[0],
-                cure=f"write what belongs there, in place of `?`{hint}",
-            )
-        )
+        number = f"{len(places)} places are" if len(places) > 1 else "one place is"
+        cure = "write what belongs there, in place of `?`"
+        cure += "; `make label` draws masks" * any(place.endswith(".masks") for place in places)
+        faults.append(InputError(f"{number} left open: {_enumerate(places)}", file=file, key=places[0], cure=cure))
     try:
         spec = convert(value, DatasetFile, file, text=text)
     except InputError as error:
@@ -136,8 +130,9 @@ def _independent_faults(error: InputError, places: list[str]) -> list[InputError
 
     def follows(fault: InputError) -> bool:
         """Return True if a fault is an open place or follows from one."""
-        unnamed = "materials[0]" in places and fault.fault.startswith("unknown material")
-        return unnamed or any(_is_within(place, fault.key) or _is_within(fault.key, place) for place in places)
+        return ("materials[0]" in places and fault.fault.startswith("unknown material")) or any(
+            _is_within(place, fault.key) or _is_within(fault.key, place) for place in places
+        )
 
     return [fault for fault in getattr(error, "faults", [error]) if not follows(fault)]
 
@@ -201,8 +196,8 @@ def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
             file.open("rb") as stream,
             mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text,
         ):
-            matches = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
-            names = [match.group(1).decode("utf-8", "replace").strip() for match in matches]
+            if text.find(b"mtllib") >= 0:
+                names = [match[1].decode("utf-8", "replace").strip() for match in MTLLIB.finditer(text)]
     elif suffix in (".gltf", ".glb"):
         header = read_header(file, key)
         try:
@@ -215,14 +210,15 @@ def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
         try:
             path_inside(refuse.folder, companion)
         except ValueError as error:
-            reason = "is outside the dataset" if "outside" in str(error) else str(error)
-            refuse(key, f"{file.name} names {companion[:80]!r}, which {reason}", "copy that file beside the mesh")
+            refuse(key, f"{file.name} names {companion[:80]!r}, which {error}", "copy that file beside the mesh")
     if is_obj:
         companions = [companion for companion in companions if os.path.isfile(refuse.folder / companion)]
     for companion in companions:
-        if not os.path.lexists(refuse.folder / companion):
-            refuse(
-                key, f"the mesh names {companion!r}, which is not there", "copy it beside the mesh, or export one .glb"
-            )
+        refuse.refuse_if(
+            not os.path.lexists(refuse.folder / companion),
+            key,
+            f"the mesh names {companion!r}, which is not there",
+            "copy it beside the mesh, or export one .glb",
+        )
         check_plain(refuse.folder / companion, "an .mtl" if is_obj else "a glTF buffer", key)
     return companions

@@ -15,7 +15,6 @@ import msgspec
 from msgspec import Meta
 
 LEFT_OUT = 255  # mask value of pixels that are neither background nor a material
-MAX_MATERIALS = LEFT_OUT - 1
 LONGEST_NAME = 100  # characters of a name; file names contain it, and file systems allow 255 bytes
 SOURCES: tuple[Literal["colmap", "transforms", "bop"], ...] = ("colmap", "transforms", "bop")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # suffixes of raw photos
@@ -34,7 +33,7 @@ Size = Annotated[float, Meta(gt=0, le=1e9, description="give its extent in the u
 Unit = Annotated[float, Meta(ge=1e-9, le=1e9, description="give the ratio of two units, more than 0: 1e-09 to 1e+09")]
 NAMES = "names have 1 to 100 of the characters A-Z a-z 0-9 _ and -, for they name files"
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]+\Z", max_length=LONGEST_NAME, description=NAMES)]
-OneOf254 = Meta(min_length=1, max_length=MAX_MATERIALS, description="give 1 to 254: a mask has no more labels")
+OneOf254 = Meta(min_length=1, max_length=LEFT_OUT - 1, description="give 1 to 254: a mask has no more labels")
 AtLeastOne = Meta(min_length=1, description="add at least one: {name: …, image: …, masks: …}")
 Vec2 = tuple[Number, Number]
 Vec3 = tuple[Number, Number, Number]

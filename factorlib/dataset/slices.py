@@ -83,11 +83,10 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
 
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
-    external = dataset.external.get(photo.name)
-    facts = schema.ObjectsSlice(photo.camera or schema.Intrinsics(), photo.objects, meshes, external)
-    files = [mesh.file for mesh in meshes.values() if mesh.file]
-    companions = [path for name in meshes for path in dataset.companions.get(name, ())]
-    return facts, files + companions + _object_masks(photo)
+    camera = photo.camera or schema.Intrinsics()
+    facts = schema.ObjectsSlice(camera, photo.objects, meshes, dataset.external.get(photo.name))
+    files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ())) if path]
+    return facts, files + _object_masks(photo)
 
 
 def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:

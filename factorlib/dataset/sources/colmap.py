@@ -44,8 +44,8 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
         refuse(KEY, f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)", CURE)
     is_text = camera_file.suffix == ".txt"
     with reading("a COLMAP model", camera_file, KEY, CURE):
-        camera_lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)
-        cameras = {line[0]: line for line in camera_lines}
+        lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)
+        cameras = {line[0]: line for line in lines}
         for _, model, _, _, params in cameras.values():
             if len(params) != _parameter_count(model):
                 raise ValueError(f"a {model} camera has {_parameter_count(model)} parameters, not {len(params)}")
@@ -70,8 +70,8 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
             "is not a pose: its numbers are zero, not finite or too large",
             DAMAGED,
         )
-        unit = [value / length for value in (*quaternion[1:], quaternion[0])]
-        motion = pycolmap.Rigid3d(pycolmap.Rotation3d(unit), [x, y, z])
+        turn = pycolmap.Rotation3d([value / length for value in (*quaternion[1:], quaternion[0])])
+        motion = pycolmap.Rigid3d(turn, [x, y, z])
         images.append(SourceImage(name, camera, (camera.width, camera.height), key, cam_from_world=motion))
     return images
 

@@ -68,8 +68,13 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
                 camera = ExternalCamera(kind, intrinsics.focal_px, intrinsics.principal_point, None, poses)
             else:
                 focal, centre = pinhole(image.camera, image.key, refuse)
-                known = focal if image.focal_known else None
-                camera = ExternalCamera(kind, known, None if image.centred else centre, image.size, poses)
+                camera = ExternalCamera(
+                    kind,
+                    focal if image.focal_known else None,
+                    None if image.centred else centre,
+                    image.size,
+                    poses,
+                )
             external[photo.name] = camera
             if source.world_from_camera and photo.world_from_camera is None:
                 assert image.cam_from_world is not None  # world_from_camera does not go with bop, which has no world
@@ -111,16 +116,22 @@ def match_images(
             continue
         matches = ([image for pattern in each for image in by_pattern.get(pattern, [])] for each in _patterns(place))
         candidates = next(filter(None, matches), [])
-        if len(candidates) > 1:
-            names = ", ".join(repr(image.name) for image in candidates[:3])
-            fault = f"{place!r} matches several images of the source: {names}"
-            refuse(key, fault, f"choose one: cameras.images: {{{photo}: …}}")
+        names = ", ".join(repr(image.name) for image in candidates[:3])
+        refuse.refuse_if(
+            len(candidates) > 1,
+            key,
+            f"{place!r} matches several images of the source: {names}",
+            f"choose one: cameras.images: {{{photo}: …}}",
+        )
         if candidates:
             result[photo] = candidates[0]
-    if not result:
-        examples = ", ".join(repr(image.name) for image in images[:3]) or "none at all"
-        cure = "assign images to photos: cameras.images: {photo: image, …}"
-        refuse(f"cameras.{kind}", f"none of its {len(images)} images ({examples}) has the name of a photo", cure)
+    examples = ", ".join(repr(image.name) for image in images[:3]) or "none at all"
+    refuse.refuse_if(
+        not result,
+        f"cameras.{kind}",
+        f"none of its {len(images)} images ({examples}) has the name of a photo",
+        "assign images to photos: cameras.images: {photo: image, …}",
+    )
     return result
 
 
@@ -166,9 +177,12 @@ def _poses(
     similarities = {name: Similarity() for name in hulls} | source.world_from_object
     placed = {obj.name: similarities[obj.name] for obj in objects if obj.name in similarities}
     scales = sorted({similarity.scale for similarity in placed.values()})
-    if len(scales) > 1:
-        fault = f"photo {photo.name!r} has objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
-        refuse("cameras.world_from_object", fault, "scale the mesh files so that a photo's objects have one scale")
+    refuse.refuse_if(
+        len(scales) > 1,
+        "cameras.world_from_object",
+        f"photo {photo.name!r} has objects of different scales, {', '.join(f'{s:g}' for s in scales)}",
+        "scale the mesh files so that a photo's objects have one scale",
+    )
     for name, similarity in placed.items():  # The mesh's unit replaces the source's, which changes no picture.
         assert image.cam_from_world is not None  # only bop has no world
         cam_from_object = image.cam_from_world * rigid_motion(similarity.rotation, similarity.translation)

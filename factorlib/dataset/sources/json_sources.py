@@ -24,12 +24,16 @@ FISHEYE = "OPENCV_FISHEYE"
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 ANY_WIDTH = 1000.0  # assumed width of an image with only a known field of view
 Side = Annotated[float, msgspec.Meta(ge=1, le=SIDE_PX, description="an image has 1 to 1e+06 pixels a side")]
-Row4 = tuple[Number, Number, Number, Number]
 KEY = "cameras.bop"
 CAMERAS = "scene_camera.json"
 POSES = "scene_gt.json"
-IDS = "it is not the id of an image: ids are whole numbers, of 18 digits at most"
-ImageId = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,18}\Z", description=IDS)]
+ImageId = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"^[0-9]{1,18}\Z",
+        description="it is not the id of an image: ids are whole numbers, of 18 digits at most",
+    ),
+]
 Nine = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]
 
 
@@ -60,7 +64,7 @@ class Frame(FrameCamera, frozen=True, kw_only=True):
     """An image and its camera; transform_matrix is world_from_camera in OpenGL's axes, with 3 or 4 rows, if known."""
 
     file_path: str
-    transform_matrix: list[Row4] | None = None
+    transform_matrix: list[tuple[Number, Number, Number, Number]] | None = None
 
 
 class TransformsFile(FrameCamera, frozen=True, kw_only=True):
@@ -80,16 +84,9 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
     images = []
     for index, frame in enumerate(content.frames):
         key = f"frames[{index}]"
-        shared = msgspec.structs.asdict(content)
-        lens = FrameCamera(
-            **{
-                name: shared[name] if (value := getattr(frame, name)) is None else value
-                for name in FrameCamera.__struct_fields__
-            }
-        )
+        pairs = ((name, getattr(frame, name), getattr(content, name)) for name in FrameCamera.__struct_fields__)
+        lens = FrameCamera(**{name: shared if own is None else own for name, own, shared in pairs})
         camera, size = _camera(key, lens, refuse)
-        focal_known = lens.fl_x is not None or lens.camera_angle_x is not None
-        centred = lens.cx is None or lens.cy is None
         matrix_key = f"{key}.transform_matrix"
         if (rows := frame.transform_matrix) is None:
             log.warning("%s: %s: %s has no transform_matrix: its camera is not known", file, key, frame.file_path)
@@ -102,9 +99,16 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
         )
         refuse.check_rotation(matrix_key, tuple(row[:3] for row in rows[:3]))
         right, down, forward = ((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
-        cam_from_world = rigid_motion((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
-        place = f"{file.name}: {key}"
-        images.append(SourceImage(frame.file_path, camera, size, place, centred, focal_known, cam_from_world))
+        image = SourceImage(
+            name=frame.file_path,
+            camera=camera,
+            size=size,
+            key=f"{file.name}: {key}",
+            centred=lens.cx is None or lens.cy is None,
+            focal_known=lens.fl_x is not None or lens.camera_angle_x is not None,
+            cam_from_world=rigid_motion((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse(),
+        )
+        images.append(image)
     refuse.refuse_if(not images, "frames", "none has a transform_matrix", "register the photos, or remove this file")
     return images
 
@@ -126,13 +130,16 @@ def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Came
             "give it in radians, more than 0 and less than π",
         )
         if lens.w is None:
-            params = [focal, ANY_WIDTH / 2, 0.5]
-            return colmap_camera(key, "SIMPLE_PINHOLE", ANY_WIDTH, 1, params, refuse), (ANY_WIDTH, None)
+            camera = colmap_camera(key, "SIMPLE_PINHOLE", ANY_WIDTH, 1, [focal, ANY_WIDTH / 2, 0.5], refuse)
+            return camera, (ANY_WIDTH, None)
     size = (lens.w, lens.h) if lens.w is not None and lens.h is not None else None
     width, height = size or (2 * max(lens.cx or focal, 1.0), 2 * max(lens.cy or focal, 1.0))
-    cx = width / 2 if lens.cx is None else lens.cx
-    cy = height / 2 if lens.cy is None else lens.cy
-    pinhole = [focal, focal if lens.fl_y is None else lens.fl_y, cx, cy]
+    pinhole = [
+        focal,
+        focal if lens.fl_y is None else lens.fl_y,
+        width / 2 if lens.cx is None else lens.cx,
+        height / 2 if lens.cy is None else lens.cy,
+    ]
     k1, k2, k3, k4, p1, p2 = (value or 0.0 for value in (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2))
     is_perspective = lens.camera_model in (None, *PERSPECTIVE)
     if not any((k1, k2, k3, k4, p1, p2)) and not lens.is_fisheye and is_perspective:
@@ -185,9 +192,8 @@ def read_bop(path: str, refuse: Refusal) -> list[SourceImage]:
             "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels",
         )
         # pixel centres from whole numbers to 0.5
-        size = (2 * cx + 1, 2 * cy + 1)
         params = [fx, fy, cx + 0.5, cy + 0.5]
-        pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", *size, params, camera_refusal)
+        pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", 2 * cx + 1, 2 * cy + 1, params, camera_refusal)
         instances: dict[int, list[RigidTransform]] = {}
         for index, obj in enumerate(poses.get(image, [])):
             rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))

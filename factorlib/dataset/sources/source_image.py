@@ -56,9 +56,8 @@ def read_source(file: Path, type_: type, key: str | None = None) -> Any:
     Raises:
         InputError: The file does not hold such a value; the error names file and key.
     """
-    text = read_text(file, "a JSON file", key, MOST_BYTES)
     with reading("JSON", file, key):
-        return convert(json.loads(text), type_, file)
+        return convert(json.loads(read_text(file, "a JSON file", key, MOST_BYTES)), type_, file)
 
 
 def colmap_camera(
@@ -97,13 +96,19 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
     """
     centre = float(camera.principal_point_x), float(camera.principal_point_y)
     focals = camera.focal_length_x, camera.focal_length_y
-    if not (min(camera.width, camera.height, *focals) > 0 and math.isfinite(sum(camera.params))):
-        size = f"{camera.width}×{camera.height} pixels"
-        refuse(key, f"is not a camera: {size}, {camera.model_name} {camera.params_to_string()}", DAMAGED)
-    if not (all(FOCAL_PX[0] <= f <= FOCAL_PX[1] for f in focals) and max(map(abs, centre)) <= CENTRE_PX):
-        fault = f"its focal length {focals[0]:g} px or principal point ({centre[0]:g}, {centre[1]:g}) is implausible"
-        cure = f"focal lengths are {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, principal points up to {CENTRE_PX:g} px away"
-        refuse(key, fault, f"{cure}; {DAMAGED}")
+    refuse.refuse_if(
+        not (min(camera.width, camera.height, *focals) > 0 and math.isfinite(sum(camera.params))),
+        key,
+        f"is not a camera: {camera.width}×{camera.height} pixels, {camera.model_name} {camera.params_to_string()}",
+        DAMAGED,
+    )
+    refuse.refuse_if(
+        not (all(FOCAL_PX[0] <= f <= FOCAL_PX[1] for f in focals) and max(map(abs, centre)) <= CENTRE_PX),
+        key,
+        f"its focal length {focals[0]:g} px or principal point ({centre[0]:g}, {centre[1]:g}) is implausible",
+        f"focal lengths are {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, principal points up to {CENTRE_PX:g} px away; "
+        f"{DAMAGED}",
+    )
     # a fisheye's projection is no pinhole's, even with all parameters 0
     undistorted = camera.is_undistorted() and "FISHEYE" not in camera.model_name
     if undistorted and focals[0] == focals[1]:
@@ -117,21 +122,19 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         assert slopes is not None  # as of a single point; rows of many points are NaN
         focal = float((slopes * places).sum() / (slopes * slopes).sum())
         error = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
-    if not error <= MOST_OFF_PX:  # NaN where a pixel has no ray
-        extent = f"by {error:.1f} px" if error == error else "so much that some pixels have no ray"
-        cause = "the camera's lens distorts"
-        cure = (
-            "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
-            "or undistort by `colmap image_undistorter` and use its images, its model, and masks of them"
-        )
-        if undistorted:
-            cause = "the camera's pixels are not square"
-            cure = (
-                "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
-                "or resample photos and masks to square pixels"
-            )
-        limit = f"at most {MOST_OFF_PX} px is allowed"
-        refuse(key, f"{cause}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
+    extent = f"by {error:.1f} px" if error == error else "so much that some pixels have no ray"
+    cause = "pixels are not square" if undistorted else "lens distorts"
+    refuse.refuse_if(
+        not error <= MOST_OFF_PX,  # NaN where a pixel has no ray
+        key,
+        f"the camera's {cause}: it differs from a pinhole of one focal length {extent}; "
+        f"at most {MOST_OFF_PX} px is allowed",
+        "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
+        "or resample photos and masks to square pixels"
+        if undistorted
+        else "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
+        "or undistort by `colmap image_undistorter` and use its images, its model, and masks of them",
+    )
     return focal, centre
 
 
