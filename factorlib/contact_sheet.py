@@ -72,11 +72,10 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
             named.append(("labels", _colour_labels(image, labels, colours)))
         for obj in photo.objects:
             entry = spec.meshes.get(obj.mesh)
-            if entry is None or entry.file is None:  # left open, or reconstructed from the masks
-                continue
-            with suppress(InputError, ValueError):
-                mesh = read_mesh(path_inside(folder, entry.file), names, entry.part_materials, obj.materials)
-                named.append((obj.name, render_mesh(mesh, colours)))
+            if entry and entry.file:  # neither left open, nor reconstructed from the masks
+                with suppress(InputError, ValueError):
+                    mesh = read_mesh(path_inside(folder, entry.file), names, entry.part_materials, obj.materials)
+                    named.append((obj.name, render_mesh(mesh, colours)))
         titled = []
         for title, each in named:
             head = Image.new("RGB", (each.shape[1], HEAD), PAPER)
@@ -154,5 +153,4 @@ def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> 
 
 
 def _pad(pixels: Pixels, height: int, width: int) -> Pixels:
-    pad = ((0, height - pixels.shape[0]), (0, width - pixels.shape[1]), (0, 0))
-    return np.pad(pixels, pad, constant_values=255)
+    return np.pad(pixels, ((0, height - pixels.shape[0]), (0, width - pixels.shape[1]), (0, 0)), constant_values=255)

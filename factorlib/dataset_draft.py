@@ -75,10 +75,6 @@ NO_MASKS = (
     "or give MASKS=<folder>"
 )
 
-NO_MASK = "photo {0}: no mask called {0}.png or {0}_<material>.png"
-NO_MATERIAL = "no mask names a material: write the names in `materials`, label k of a mask the k-th"
-RESERVED = "photo {0}: write another `name`: a file of the results is called {0}"
-
 
 class Masks(msgspec.Struct):
     """Masks of all photos, as dataset.yaml names them.
@@ -99,8 +95,12 @@ def photos_in(photos: Path) -> tuple[dict[str, Path], dict[str, Path], Cameras |
     files, masks, cameras = read_photo_folder(photos, _files(photos, SUFFIXES, "PHOTOS", deep=True))
     images = _by_name(files, "PHOTOS", photos)
     if not images:
-        fault = f"the folder has no photos ({', '.join(IMAGES[:6])}, …)"
-        raise InputError(fault, file=photos, key="PHOTOS", cure="name the folder of the photos")
+        raise InputError(
+            f"the folder has no photos ({', '.join(IMAGES[:6])}, …)",
+            file=photos,
+            key="PHOTOS",
+            cure="name the folder of the photos",
+        )
     return images, {name: masks[path] for name, path in images.items() if path in masks}, cameras
 
 
@@ -122,14 +122,20 @@ def new_dataset(
     above = check_target(target)
     images, photo_masks, source = photos_in(photos)
     beside = {} if masks else photo_masks
-    masks, mask_files = _mask_files(masks, sorted(beside.values()))
+    mask_files = _files(masks, (*MASKS, LABELMAP), "MASKS", deep=True) if masks else sorted(beside.values())
+    if beside:
+        masks = Path(os.path.commonpath([path.parent for path in mask_files]))
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes else []  # including .mtl and buffers
     missing: list[str] = []
     paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
     labelled = _masks(masks, mask_files, paths, beside, missing) if masks else _cut_outs(paths, images, missing)
-    entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
+    entries = _meshes(meshes, mesh_files, labelled.materials) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
-    unmasked = [NO_MASK.format(photo) for photo in images if photo not in labelled.by_photo]
+    unmasked = [
+        f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
+        for photo in images
+        if photo not in labelled.by_photo
+    ]
     missing += unmasked if masks or labelled.by_photo else [NO_MASKS]
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
@@ -139,23 +145,25 @@ def new_dataset(
         visible = {photo: [HULL] for photo in images}
     cameras = cameras or source or Cameras()
     spec |= {"cameras": cameras.source} if cameras.source else {}
-    missing += [NO_MATERIAL] * (not labelled.materials and masks is not None)
-    missing += [RESERVED.format(photo) for photo in images if photo in RESERVED_PHOTOS]
+    if masks and not labelled.materials:
+        missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
+    missing += [
+        f"photo {photo}: write another `name`: a file of the results is called {photo}"
+        for photo in images
+        if photo in RESERVED_PHOTOS
+    ]
     spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled)}
     spec["photos"] = [photo | cameras.by_photo.get(photo["name"], {}) for photo in spec["photos"]]
-    sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
-    sources["cameras"] = cameras.folder, cameras.files
+    sources = {
+        "photos": (photos, images.values()),
+        "masks": (masks, mask_files),
+        "meshes": (meshes, mesh_files),
+        "cameras": (cameras.folder, cameras.files),
+    }
     places = {name: (folder, files) for name, (folder, files) in sources.items() if folder}
     _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     _write(target, spec, places, above)
     return missing
-
-
-def _mask_files(masks: Path | None, beside: list[Path]) -> tuple[Path | None, list[Path]]:
-    """Return the folder of masks and its files; without a folder, that of the masks beside the photos, if any."""
-    if masks is None:
-        return (Path(os.path.commonpath([path.parent for path in beside])), beside) if beside else (None, [])
-    return masks, _files(masks, (*MASKS, LABELMAP), "MASKS", deep=True)
 
 
 def check_target(target: Path) -> Path:
@@ -179,10 +187,8 @@ def _visible_meshes(
     visible = {}
     for photo in photos:
         masks = labelled.by_photo.get(photo)
-        materials = masks if isinstance(masks, dict) else ()
-        visible[photo] = _meshes_named_in(photo, entries) or sorted(
-            {mesh_of[word] for word in materials if times[word] == 1}
-        )
+        shown = {mesh_of[word] for word in masks if times[word] == 1} if isinstance(masks, dict) else ()
+        visible[photo] = _meshes_named_in(photo, entries) or sorted(shown)
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in photos if not visible[photo]]
     return visible
@@ -191,8 +197,7 @@ def _visible_meshes(
 def _shape(materials: list[str], cameras: Cameras) -> dict[str, Any]:
     """Return the entry of a mesh without a file: a hull, a body of revolution, or open where nothing is known."""
     parts = {"parts": {name: name for name in materials}} if len(materials) > 1 else {"material": materials[0]}
-    without = {"lathe": True} if cameras.revolved else {"file": UNKNOWN}
-    return ({"hull": True} if cameras.source else without) | parts
+    return ({"hull": True} if cameras.source else {"lathe": True} if cameras.revolved else {"file": UNKNOWN}) | parts
 
 
 def _photo_entries(
@@ -226,9 +231,9 @@ def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[P
             write_text(draft / "dataset.yaml", REMARK + text)
             draft.rename(target)
     except OSError as error:
-        cure = "name another folder for the dataset"
-        known = disk_error(error, target.parent)
-        raise known or InputError("no folder can be created here", file=above, key="DATASET", cure=cure) from error
+        raise disk_error(error, target.parent) or InputError(
+            "no folder can be created here", file=above, key="DATASET", cure="name another folder for the dataset"
+        ) from error
 
 
 def _masks(
@@ -314,8 +319,10 @@ def _name_outlines(masks: Masks, photos: Iterable[str], missing: list[str]) -> N
                 f"photo {photo}: {mask} has no labels: cut at half, it is the silhouette of {masks.materials[0]}"
             )
         else:
-            cure = f"the mask of one material is called {photo}_<material>.png"
-            missing.append(f"photo {photo}: {mask} has no label, for {LEFT_OUT} means left out; {cure}")
+            missing.append(
+                f"photo {photo}: {mask} has no label, for {LEFT_OUT} means left out; "
+                f"the mask of one material is called {photo}_<material>.png"
+            )
 
 
 def _cut_outs(photos: Mapping[str, str], images: Mapping[str, Path], missing: list[str]) -> Masks:
@@ -341,10 +348,11 @@ def _annotated_materials(path: Path, file: str, missing: list[str]) -> list[str]
         above = {each.supercategory for each in coco.categories}  # Roboflow names its project as a category
         found = [each.name for each in coco.categories if each.id in used or each.name not in above]
     names = {name: _word(name) for name in found}
-    for name, word in names.items():
-        if word != name:
-            letters = "names are made of A-Z a-z 0-9 _ and -"
-            missing.append(f"{file}: rename its category {name!r} to {word!r}: {letters}")
+    missing += [
+        f"{file}: rename its category {name!r} to {word!r}: names are made of A-Z a-z 0-9 _ and -"
+        for name, word in names.items()
+        if word != name
+    ]
     return list(names.values())
 
 
@@ -387,16 +395,13 @@ def _masks_by_photo(
     return whole, further
 
 
-def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict[str, Any]]:
+def _meshes(folder: Path, files: list[Path], materials: list[str]) -> dict[str, dict[str, Any]]:
     """Return the entry of each mesh, with a part's own name as its material if there is a material of that name."""
     entries: dict[str, dict[str, Any]] = {}
     for name, path in _by_name([path for path in files if path.suffix.lower() in MESHES], "MESHES").items():
-        parts = list(dict.fromkeys(names[0] for names in read_parts(path)))
-        file = f"meshes/{path.relative_to(folder)}"
-        if len(materials) == 1:
-            entries[name] = {"file": file, "material": materials[0]}
-            continue
-        entries[name] = {"file": file, "parts": {part: part if part in materials else UNKNOWN for part in parts}}
+        parts = {names[0]: names[0] if names[0] in materials else UNKNOWN for names in read_parts(path)}
+        entries[name] = {"file": f"meshes/{path.relative_to(folder)}"}
+        entries[name] |= {"material": materials[0]} if len(materials) == 1 else {"parts": parts}
     return entries
 
 
@@ -443,8 +448,9 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
                     obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'unknown from the mask'}"
                     missing.append(f"photo {photo}: write which material {part} of {obj['name']} is made of")
         if known:
-            parts = ", ".join(known)
-            missing.append(f"mesh {name}: check the materials of {parts}, which were derived from silhouettes alone")
+            missing.append(
+                f"mesh {name}: check the materials of {', '.join(known)}, which were derived from silhouettes alone"
+            )
 
 
 def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[str], Path]) -> Silhouette:
@@ -482,8 +488,9 @@ def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool 
         if path.name.startswith("._") or (suffixes is not None and not path.name.lower().endswith(suffixes)):
             continue
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            cure = "put a copy of the file there, or remove it"
-            raise InputError("is a link, or not a plain file", file=path, key=key, cure=cure)
+            raise InputError(
+                "is a link, or not a plain file", file=path, key=key, cure="put a copy of the file there, or remove it"
+            )
         if not path.name.isprintable():
             raise InputError(
                 f"the file name {path.name!a} cannot be printed", file=folder, key=key, cure="rename that file"
@@ -501,8 +508,12 @@ def _by_name(paths: list[Path], key: str, folder: Path | None = None) -> dict[st
         whole = folder is not None and times[path.stem] > 1 and path.parent != folder
         stem = str(path.relative_to(folder).with_suffix("")) if whole else path.stem  # type: ignore[arg-type]
         if (namesake := named.setdefault(name := _word(stem), path)) != path:
-            fault = f"{path.name} and {namesake.name} would both be called {name!r}"
-            raise InputError(fault, file=path, key=key, cure="rename one of them")
+            raise InputError(
+                f"{path.name} and {namesake.name} would both be called {name!r}",
+                file=path,
+                key=key,
+                cure="rename one of them",
+            )
     return named
 
 

@@ -126,8 +126,12 @@ def _parse(text: str, name: str | Path, most_values: int) -> tuple[Any, dict[Key
     def plain(node: yaml.Node, keys: Keys) -> Any:
         """Convert a node, and record the lines of what it holds."""
         if next(number) > most_values:
-            cure = "check that it is the right file: an alias (*name) repeats all that its anchor (&name) holds"
-            refuse(f"holds more than {most_values:,} values", node, (), cure)
+            refuse(
+                f"holds more than {most_values:,} values",
+                node,
+                (),
+                "check that it is the right file: an alias (*name) repeats all that its anchor (&name) holds",
+            )
         if len(keys) > MOST_DEPTH:
             refuse(f"lists and maps are nested more than {MOST_DEPTH} deep", node, keys[:4], TOO_DEEP)
         if node.tag:
@@ -143,8 +147,12 @@ def _parse(text: str, name: str | Path, most_values: int) -> tuple[Any, dict[Key
                 refuse("a key is a list or a map, not a word", word, keys, "write key: value")
             below = (*keys, word.value)
             if word.value in values:
-                fault = f"the key {one_line(repr(word.value))} occurs twice, first on line {lines[below]}"
-                refuse(fault, word, below, "delete or rename one of them")
+                refuse(
+                    f"the key {one_line(repr(word.value))} occurs twice, first on line {lines[below]}",
+                    word,
+                    below,
+                    "delete or rename one of them",
+                )
             lines[below] = word.start_mark.line + 1
             values[word.value] = plain(item, below)
         return values
@@ -201,9 +209,8 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
         fault, cure, keys = _describe(each)
         # line of the value, or of the last existing part of its path
         line = next((lines[keys[:k]] for k in range(len(keys), -1, -1) if keys[:k] in lines), None)
-        file = f"{name}:{line}" if line else name
         key = ".".join(filter(None, (prefix, key_path(keys)))) or None
-        faults.append(InputError(fault, file=file, key=key, cure=cure))
+        faults.append(InputError(fault, file=f"{name}:{line}" if line else name, key=key, cure=cure))
     raise_all(faults)
     raise AssertionError("a validation error has a fault")
 

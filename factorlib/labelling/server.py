@@ -40,14 +40,12 @@ from factorlib.reading import read_bytes, read_text
 from factorlib.wholefile import replace_file
 from factorlib.yamlfile import parse_yaml, read_yaml, with_value
 
-OnePng = msgspec.Meta(
-    description='here one label PNG a photo is drawn: name it, also if it is not there yet, or write masks: "?"'
-)
-CONTENT = (
-    "default-src 'none'; img-src data:; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "connect-src 'self'; frame-ancestors 'none'"
-)
-HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "Content-Security-Policy": CONTENT}
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "default-src 'none'; img-src data:; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; connect-src 'self'; frame-ancestors 'none'",
+}
 NO_FILE = "none"  # version of a mask that does not exist yet
 
 
@@ -56,7 +54,12 @@ class LabelledPhoto(msgspec.Struct, frozen=True):
 
     name: Name
     image: str
-    masks: Annotated[str, OnePng]
+    masks: Annotated[
+        str,
+        msgspec.Meta(
+            description='here one label PNG a photo is drawn: name it, also if it is not there yet, or write masks: "?"'
+        ),
+    ]
     encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
 
 
@@ -129,14 +132,13 @@ class MaskSet:
         """
         png = png_bytes(self._known(labels, index)[..., None])
         path = self.files[index]
-        photo = self.photos[index].name
         if self.version(index) != version:
             raise InputError(
                 "has changed on disk meanwhile: nothing was written",
                 file=path,
                 cure="press R to read it (what was drawn since the last save is lost), or move the file away",
             )
-        named = self._named(photo)
+        named = self._named(self.photos[index].name)
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, png)
         if named is not None:
@@ -166,8 +168,9 @@ class MaskSet:
 
     def version(self, index: int) -> str:
         """Return the hash of a mask's file, or NO_FILE if it does not exist."""
-        exists = file_exists(self.files[index], "masks")
-        return hashlib.sha256(read_bytes(self.files[index], "a PNG")).hexdigest() if exists else NO_FILE
+        if not file_exists(self.files[index], "masks"):
+            return NO_FILE
+        return hashlib.sha256(read_bytes(self.files[index], "a PNG")).hexdigest()
 
     def _known(self, labels: np.ndarray, index: int) -> np.ndarray:
         """Return the labels; InputError if one has no material."""
@@ -215,8 +218,8 @@ class _Request(BaseHTTPRequestHandler):
         query = {name: values[0] for name, values in parse_qs(url.query).items()}
         is_page = (self.command, url.path) == ("GET", "/")
         token = query.get("token", "") if is_page else self.headers.get("X-Token", "")
-        is_local = self.headers.get_all("Host") == [server.host]
-        is_local = is_local and self.headers.get("Origin", f"http://{server.host}") == f"http://{server.host}"
+        is_own_origin = self.headers.get("Origin", f"http://{server.host}") == f"http://{server.host}"
+        is_local = is_own_origin and self.headers.get_all("Host") == [server.host]
         try:
             if is_local and secrets.compare_digest(token.encode(), server.token.encode()):
                 return self._send(200, *self._answer(url.path, query))
@@ -250,8 +253,11 @@ class _Request(BaseHTTPRequestHandler):
                 return (files("factorlib.labelling") / "page.html").read_bytes(), "text/html; charset=utf-8"
             case "GET", "/set":
                 materials = list(zip(masks.materials, cycle(PALETTE)))  # colours that stand out from the materials
-                photos = [photo.name for photo in masks.photos]
-                about = {"name": masks.folder.name, "photos": photos, "materials": materials}
+                about = {
+                    "name": masks.folder.name,
+                    "photos": [photo.name for photo in masks.photos],
+                    "materials": materials,
+                }
                 return msgspec.json.encode(about), "application/json"
             case "GET", "photo":
                 Image.fromarray(masks.picture(index)).save(stream := io.BytesIO(), "JPEG", quality=95)

@@ -41,7 +41,6 @@ OUTLINE_PIXELS = 40_000  # pixels of a photo whose outline is asked for its symm
 DISAGREES = 0.8  # a mask's agreement with the hull of the others, as a share of the median one, below which it is named
 LENS_ERROR = 0.005  # greatest error of a lens by two coefficients, in widths of the image
 MARGINS = (0.05, 0.15)  # margins about the hull's box, in its longer side, of the crops that masks are estimated from
-FOCAL_KEYS = ("fl_x", "camera_angle_x")
 Report = Callable[[float, str], None]
 SHAPE = (
     "photos without known cameras do not tell the shape, and too few of them overlap to find cameras: in `meshes`, "
@@ -53,11 +52,6 @@ REVOLVED = (
     "`primitive: ball | box | cylinder` or `file: <mesh>` instead"
 )
 NAMES = "rename materials and meshes in dataset.yaml now, if at all: another name later makes all steps run again"
-NO_FOREGROUND = "draw masks: `make new`, then `make label`"
-ONE_LIGHT = (
-    "one light at rest is assumed: where photos have different ones, delete `illumination: room`; where the thing "
-    "turned before a camera at rest, delete `world_from_camera: true`"
-)
 
 
 class View(msgspec.Struct, frozen=True):
@@ -81,10 +75,14 @@ class View(msgspec.Struct, frozen=True):
         """Return the outline of the foreground with the camera of a source; `focal` replaces its focal length."""
         camera = self.small.camera
         scale = camera.width / (image.size[0] if image.size else self.size[1])
-        centre = (scale * image.camera.principal_point_x, scale * image.camera.principal_point_y)
-        if image.centred or image.size is None or image.size[1] is None:
-            centre = camera.centre
-        camera = Camera(camera.width, camera.height, scale * (focal or image.camera.mean_focal_length()), centre)
+        has_centre = not image.centred and image.size is not None and image.size[1] is not None
+        principal_point = (scale * image.camera.principal_point_x, scale * image.camera.principal_point_y)
+        camera = Camera(
+            camera.width,
+            camera.height,
+            scale * (focal or image.camera.mean_focal_length()),
+            principal_point if has_centre else camera.centre,
+        )
         assert image.cam_from_world is not None  # the sources of a folder have a world
         pose = Pose(image.cam_from_world.rotation.matrix(), np.array(image.cam_from_world.translation))
         return Outline(name, self.small.objects.astype(int), camera, pose=pose)
@@ -166,11 +164,11 @@ def read_views(
         objects = box_majority(mask, photo.factor)
         camera = Camera(photo.width, photo.height, 1.0, (photo.width / 2, photo.height / 2))
         prior = with_prior_focal(camera, photo.focal_px, "exif")
-        grey = pixels.mean(axis=2).astype(np.uint8)
-        small = PhotoForMotion(grey, objects, np.zeros_like(objects), *prior)
+        small = PhotoForMotion(pixels.mean(axis=2).astype(np.uint8), objects, np.zeros_like(objects), *prior)
         views[name] = View(small, opened.size, uncertain, matted, describe_specks(mask))
     if not any(view.small.objects.any() for view in views.values()):
-        raise InputError("no photo has a foreground", file=path.parent, key="PHOTOS", cure=NO_FOREGROUND)
+        cure = "draw masks: `make new`, then `make label`"
+        raise InputError("no photo has a foreground", file=path.parent, key="PHOTOS", cure=cure)
     return views
 
 
@@ -194,10 +192,13 @@ def cameras_of_folder(
         """Return the outlines, by another focal length if it is given."""
         return [view.outline(name, images[name], focal) for name, view in views.items() if name in images]
 
-    notes = [ONE_LIGHT]
+    notes = [
+        "one light at rest is assumed: where photos have different ones, delete `illumination: room`; where the thing "
+        "turned before a camera at rest, delete `world_from_camera: true`"
+    ]
     images = match_source(paths, cameras)
     content = json.loads(cameras.files[0].read_text()) if "transforms" in cameras.source else {}
-    if content and not any(key in lens for lens in (content, *content["frames"]) for key in FOCAL_KEYS):
+    if content and not any(key in lens for lens in (content, *content["frames"]) for key in ("fl_x", "camera_angle_x")):
         height, width = next(iter(views.values())).size
         file = folder / cameras.files[0].name
         posed = [frame for frame in content["frames"] if frame.get("transform_matrix")]
@@ -209,12 +210,14 @@ def cameras_of_folder(
         write_json(file, content | {"fl_x": round(focal, 1)})
         notes.append(f"the cameras have no focal length: a hull fits the masks best at {focal:.0f} px, which is used")
         images = match_source(paths, cameras)
-    shared = {"illumination": "room"}
     by_photo = {
-        name: shared | distorted_camera(images[name], view.size[1]) for name, view in views.items() if name in images
+        name: {"illumination": "room"} | distorted_camera(images[name], view.size[1])
+        for name, view in views.items()
+        if name in images
     }
-    source = cameras.source | {"world_from_camera": True}
-    return msgspec.structs.replace(cameras, source=source, by_photo=by_photo, notes=notes), outlines()
+    return Cameras(
+        cameras.source | {"world_from_camera": True}, cameras.folder, cameras.files, by_photo, notes
+    ), outlines()
 
 
 def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, SourceImage]:
@@ -250,9 +253,13 @@ def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
     focal, *bends = (solution := np.linalg.lstsq(design, offsets)[0]).tolist()
     if np.abs(design @ solution - offsets).max() > LENS_ERROR * camera.width:
         return {}
-    place = (width / camera.width * centre).tolist()
-    distortion = [bend / focal for bend in bends]
-    return {"camera": {"focal_px": width / camera.width * focal, "principal_point": place, "distortion": distortion}}
+    return {
+        "camera": {
+            "focal_px": width / camera.width * focal,
+            "principal_point": (width / camera.width * centre).tolist(),
+            "distortion": [bend / focal for bend in bends],
+        }
+    }
 
 
 def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Cameras, list[Outline]]:
@@ -267,11 +274,13 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
         registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.4 * share, text))
     except InputError:
         return Cameras(), []
-    outlines = []
-    for name, each in registered.items():
-        camera = msgspec.structs.replace(photos[name].camera, focal=each.focal)
-        outlines.append(Outline(name, photos[name].objects.astype(int), camera, pose=each.pose))
-    return Cameras({"sfm": True}), outlines
+    cameras = {
+        name: msgspec.structs.replace(photos[name].camera, focal=each.focal) for name, each in registered.items()
+    }
+    return Cameras({"sfm": True}), [
+        Outline(name, photos[name].objects.astype(int), cameras[name], pose=each.pose)
+        for name, each in registered.items()
+    ]
 
 
 def outlined_shape(views: Mapping[str, View], report: Report) -> Cameras:
@@ -398,6 +407,6 @@ def doubtful_masks(views: Mapping[str, View], outlines: list[Outline]) -> list[s
         "its border is uncertain": [name for name, view in views.items() if view.doubt > MOST_DOUBT],
         "it differs from what the other photos show": differing(agreements_of(outlines)),
     }
-    line = "draw over the mask of {} in `make label`: {}"
-    specks = [f"mask of {name}: {view.specks}" for name, view in views.items() if view.specks]
-    return specks + [line.format(", ".join(names), why) for why, names in groups.items() if names]
+    return [f"mask of {name}: {view.specks}" for name, view in views.items() if view.specks] + [
+        f"draw over the mask of {', '.join(names)} in `make label`: {why}" for why, names in groups.items() if names
+    ]

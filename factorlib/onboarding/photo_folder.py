@@ -101,8 +101,8 @@ def stem_of(path: PurePosixPath) -> str:
 
 def _is_copy(folder: PurePosixPath, folders: Container[PurePosixPath]) -> bool:
     """Return True for a folder beside that of the same pictures at full size, or with the lens's distortion removed."""
-    better = DOWNSAMPLED.sub(r"\1", folder.name), f"corrected_{folder.name}"
-    return any(name != folder.name and folder.with_name(name) in folders for name in better)
+    better = {DOWNSAMPLED.sub(r"\1", folder.name), f"corrected_{folder.name}"} - {folder.name}
+    return any(folder.with_name(name) in folders for name in better)
 
 
 def stem_of_mask(path: PurePosixPath) -> str:
@@ -172,9 +172,8 @@ def _cameras(folder: Path, files: list[Path]) -> tuple[Cameras | None, dict[Pure
         file = transforms[0].relative_to(folder)
         names = {_beside(file, name): mask and _beside(file, mask) for name, mask in masks.items()}
         return Cameras({"transforms": f"cameras/{file.as_posix()}"}, folder, transforms[:1]), names
-    pairs = [[path.with_name(camera), path] for camera, image in MODELS for path in files if path.name == image]
-    models = [pair for pair in pairs if pair[0] in files]
-    if not models:
+    pairs = ([path.with_name(camera), path] for camera, image in MODELS for path in files if path.name == image)
+    if not (models := [pair for pair in pairs if pair[0] in files]):
         return None, {}
     model = max(models, key=lambda pair: pair[1].stat().st_size)
     at = model[0].parent.relative_to(folder).as_posix()
