@@ -413,20 +413,17 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
     materials = spec["materials"]
     for name, entry in spec["meshes"].items():
         part_materials = entry.get("parts", {})
-        objects: list[tuple[str, dict]] = []
-        silhouettes = []
+        objects: list[tuple[str, dict, Silhouette]] = []
         known = []
         if UNKNOWN not in part_materials.values():
             continue
-        for photo in spec["photos"]:
-            for obj in photo["objects"]:
-                is_separate = "mask" in obj or len(photo["objects"]) == 1
-                if obj["mesh"] == name and is_separate and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
-                    with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
-                        silhouettes.append(_silhouette(photo, obj, materials, file))
-                        objects.append((photo["name"], obj))
+        for photo, obj in [(p, obj) for p in spec["photos"] for obj in p["objects"] if obj["mesh"] == name]:
+            is_separate = "mask" in obj or len(photo["objects"]) == 1
+            if is_separate and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
+                with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
+                    objects.append((photo["name"], obj, _silhouette(photo, obj, materials, file)))
         mesh = read_mesh(file(entry["file"]), list(part_materials), {part: part for part in part_materials})
-        matches = match_parts(mesh, len(part_materials), silhouettes)
+        matches = match_parts(mesh, len(part_materials), [silhouette for _, _, silhouette in objects])
         for k, part in [(k, part) for k, part in enumerate(part_materials) if part_materials[part] == UNKNOWN]:
             ranked = [paired.labels[k] if paired else [] for paired in matches]
             margins = [paired.margins[k] if paired else 0.0 for paired in matches]
@@ -441,7 +438,7 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
             least = min(margin for margin, yes in zip(margins, sure) if yes)
             known.append(part)
             part_materials[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
-            for (photo, obj), each, yes, words in zip(objects, ranked, sure, likely):
+            for (photo, obj, _), each, yes, words in zip(objects, ranked, sure, likely):
                 if yes and each[0] != usual:
                     obj.setdefault("materials", {})[part] = materials[each[0] - 1]
                 elif not yes and HIDDEN not in each[:2]:  # not if the part may be hidden

@@ -215,9 +215,8 @@ def cameras_of_folder(
         for name, view in views.items()
         if name in images
     }
-    return Cameras(
-        cameras.source | {"world_from_camera": True}, cameras.folder, cameras.files, by_photo, notes
-    ), outlines()
+    source = cameras.source | {"world_from_camera": True}
+    return msgspec.structs.replace(cameras, source=source, by_photo=by_photo, notes=notes), outlines()
 
 
 def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, SourceImage]:
@@ -274,13 +273,12 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
         registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.4 * share, text))
     except InputError:
         return Cameras(), []
-    cameras = {
-        name: msgspec.structs.replace(photos[name].camera, focal=each.focal) for name, each in registered.items()
-    }
-    return Cameras({"sfm": True}), [
+    cameras = {name: msgspec.structs.replace(photos[name].camera, focal=registered[name].focal) for name in registered}
+    outlines = [
         Outline(name, photos[name].objects.astype(int), cameras[name], pose=each.pose)
         for name, each in registered.items()
     ]
+    return Cameras({"sfm": True}), outlines
 
 
 def outlined_shape(views: Mapping[str, View], report: Report) -> Cameras:

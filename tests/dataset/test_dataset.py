@@ -2,7 +2,6 @@
 
 import copy
 import json
-import logging
 import re
 
 import msgspec
@@ -19,7 +18,18 @@ from tests.refusal import refusal
 TURN = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 MIRROR = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]
 POSE = {"rotation": TURN, "translation": [0, 0, 2.5]}
-FILES = ["kitchen.jpg", "garden.exr", "kitchen.png", "red.png", "coco.json", "own.png", "vase.ply", "notes.txt"]
+FILES = {
+    **dict.fromkeys(["kitchen.jpg", "garden.exr", "kitchen.png", "red.png", "coco.json", "own.png"], ""),
+    **dict.fromkeys(["vase.ply", "notes.txt", "box 1.bin"], ""),
+    "chair.obj": "# a chair\nmtllib chair.mtl\nusemtl shell\n",
+    "chair.mtl": "newmtl shell\n",
+    "box.gltf": json.dumps(
+        {
+            "asset": {"version": "2.0"},
+            "buffers": [{"uri": "box%201.bin", "byteLength": 0}, {"uri": "data:,x", "byteLength": 1}],
+        }
+    ),
+}
 SPEC = {
     "format": 1,
     "materials": ["red", "white", "wood"],
@@ -53,21 +63,13 @@ SPEC = {
 
 @pytest.fixture
 def folder(tmp_path):
-    path = tmp_path / "set"
-    path.mkdir()
-    for name in FILES:
-        (path / name).write_text("")
-    (path / "chair.obj").write_text("# a chair\nmtllib chair.mtl\nusemtl shell\n")
-    (path / "chair.mtl").write_text("newmtl shell\n")
-    buffers = [{"uri": "box%201.bin", "byteLength": 0}, {"uri": "data:,x", "byteLength": 1}]
-    (path / "box.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": buffers}))
-    (path / "box 1.bin").write_text("")
-    return path
+    for name, content in FILES.items():
+        put(tmp_path / "set" / name, content)
+    return tmp_path / "set"
 
 
 def write(folder, spec=SPEC):
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(spec, sort_keys=False))
-    return folder
+    return put(folder / "dataset.yaml", yaml.safe_dump(spec, sort_keys=False)).parent
 
 
 def changed(key, value):
@@ -100,8 +102,8 @@ def test_a_slice_is_json_converts_to_its_type_and_names_the_files_it_needs(folde
     assert slices["objects"].files == ["chair.mtl", "chair.obj", "own.png", "vase.ply"]
     assert not any(slices[name].files for name in ("materials", "light", "set", "shapes", "truth"))
     assert dataset_slice(dataset, "objects", "hall").files == ["box 1.bin", "box.gltf"]
-    all_files = ["coco.json", "garden.exr", "kitchen.jpg", "kitchen.png", "own.png", "red.png"]
-    assert dataset_slice(dataset, "photo").files == all_files
+    files = ["coco.json", "garden.exr", "kitchen.jpg", "kitchen.png", "own.png", "red.png"]
+    assert dataset_slice(dataset, "photo").files == files
     (folder / "chair.mtl").unlink()  # which is not needed
     assert dataset_slice(read_dataset(folder), "objects", "garden").files == ["chair.obj"]
 
@@ -126,9 +128,8 @@ TRUTH = {
 
 
 def write_truth(folder, truth):
-    (folder / "truth").mkdir(exist_ok=True)
-    (folder / "truth" / "truth.yaml").write_text(yaml.safe_dump(truth))
-    (folder / "truth" / "garden.exr").write_text("")
+    put(folder / "truth" / "truth.yaml", yaml.safe_dump(truth))
+    put(folder / "truth" / "garden.exr", "")
     return write(folder, {**SPEC, "truth": "truth/truth.yaml"})
 
 
@@ -140,8 +141,7 @@ def test_truth_is_its_own_slice_and_a_warning_where_it_is_missing(folder, caplog
     assert all(dataset_slice(plain, name) == dataset_slice(dataset, name) for name in SLICES if name != "truth")
     for missing in ("truth/garden.exr", "truth/truth.yaml"):
         (folder / missing).unlink()
-        with caplog.at_level(logging.WARNING):
-            assert dataset_slice(read_dataset(folder), "truth").facts is None and missing in caplog.text
+        assert dataset_slice(read_dataset(folder), "truth").facts is None and missing in caplog.text
 
 
 @pytest.mark.parametrize("truth, key, cure", [
@@ -262,8 +262,7 @@ def test_a_path_is_found_with_backslashes_and_in_either_form_of_unicode(folder, 
 
 
 def test_photos_held_out_by_the_file_or_for_one_run_exist_and_leave_one_to_solve_from(folder):
-    spec = copy.deepcopy(SPEC)
-    spec["photos"][1]["held_out"] = True
+    spec = changed("photos[1].held_out", True)
     dataset = read_dataset(write(folder, spec))
     some = hold_out(dataset, ["hall,garden"])
     assert [photo.held_out for photo in some.spec.photos] == [False, True, True]
@@ -277,8 +276,7 @@ def test_photos_held_out_by_the_file_or_for_one_run_exist_and_leave_one_to_solve
 
 
 def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(folder):
-    spec = copy.deepcopy(SPEC)
-    spec["photos"][2] |= {"illumination": "kitchen"}
+    spec = changed("photos[2].illumination", "kitchen")
     spec["known"] = {
         "materials": {"wood": {"diffuse": [0, 0, 0], "specular": [0.5, 0.5, 0.5]}},
         "illumination": {"garden": "garden.exr", "kitchen": {"chrome": "box_1"}},
@@ -291,7 +289,6 @@ def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(fold
     assert caught.key == "known.illumination.kitchen.chrome" and known.files == ["garden.exr"]
     slice_ = msgspec.convert(known.facts, schema.KnownSlice)
     assert slice_.balls == {"kitchen": schema.BallSlice("hall", "wood")} and slice_.maps == {"garden": "garden.exr"}
-    (folder / "box.gltf").unlink()
     (folder / "box.obj").write_text("v 0 0 0\nv 1 0 0\nv .2 2 0\nf 1 2 3\n")
     spec["meshes"]["box"] = {"file": "box.obj", "material": "wood"}
     faults = Validation(read_dataset(write(folder, spec))).faults([("known", None, {}, folder)])

@@ -37,15 +37,13 @@ def folder(tmp_path):
 def masks(folder, **values):
     """A mask for each name, `__` in it for `/`."""
     for name, own in values.items():
-        path = folder / "masks" / f"{name.replace('__', '/')}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = put(folder / "masks" / f"{name.replace('__', '/')}.png", "")
         Image.fromarray(np.resize(np.array(own, np.uint8), (8, 10))).save(path)
 
 
 def made(folder, masks="masks", meshes="meshes"):
     """What is missing, and what dataset.yaml says."""
-    of = [folder / name if name else None for name in ("photos", masks, meshes)]
-    missing = new_dataset(folder / "data" / "mine", *of)
+    missing = new_dataset(folder / "data" / "mine", *(name and folder / name for name in ("photos", masks, meshes)))
     return missing, load_yaml(folder / "data" / "mine" / "dataset.yaml")
 
 
@@ -96,8 +94,7 @@ def test_masks_of_labelme_and_of_cvat_are_copied_and_name_the_materials(folder):
     _, spec = made(folder)
     assert spec["materials"] == ["shell", "legs"]
     assert spec["photos"][1]["masks"] == "masks/SegmentationClass/kitchen.png"
-    file = dataset_slice(read_dataset(folder / "data" / "mine"), "photo", "kitchen").files
-    assert "masks/labelmap.txt" in file
+    assert "masks/labelmap.txt" in dataset_slice(read_dataset(folder / "data" / "mine"), "photo", "kitchen").files
 
 
 def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder):
@@ -127,16 +124,22 @@ def test_masks_in_folders_are_those_of_the_photos_in_such_folders(folder, photos
 
 
 def test_a_coco_file_names_the_materials_of_all_photos_and_what_is_no_name_is_to_be_renamed(folder):
-    outlines = [{"id": k, "image_id": k, "category_id": 1, "segmentation": [[1, 1, 5, 1, 5, 5]]} for k in (0, 1)]
-    images = [{"id": k, "file_name": photo} for k, photo in enumerate(("kitchen.jpg", "IMG 0412.png"))]
-    categories = [{"id": 1, "name": "red shell", "supercategory": "chairs"}, {"id": 2, "name": "legs"}]
-    categories += [{"id": 0, "name": "chairs", "supercategory": "none"}]  # as Roboflow names its project
-    coco = {"images": images, "annotations": outlines, "categories": categories}
+    outline = {"category_id": 1, "segmentation": [[1, 1, 5, 1, 5, 5]]}
+    coco = {
+        "images": [{"id": 0, "file_name": "kitchen.jpg"}, {"id": 1, "file_name": "IMG 0412.png"}],
+        "annotations": [outline | {"id": k, "image_id": k} for k in (0, 1)],
+        "categories": [
+            {"id": 1, "name": "red shell", "supercategory": "chairs"},
+            {"id": 2, "name": "legs"},
+            {"id": 0, "name": "chairs", "supercategory": "none"},  # as Roboflow names its project
+        ],
+    }
     (folder / "masks" / "all.json").write_text(json.dumps(coco))
     (folder / "meshes" / "chair.obj").write_text(OBJ.replace("g shell", "g red_shell"))
     missing, spec = made(folder)
-    letters = "names are made of A-Z a-z 0-9 _ and -"
-    assert missing == [f"masks/all.json: rename its category 'red shell' to 'red_shell': {letters}"]
+    assert missing == [
+        "masks/all.json: rename its category 'red shell' to 'red_shell': names are made of A-Z a-z 0-9 _ and -"
+    ]
     assert spec["materials"] == ["red_shell", "legs"] and {p["masks"] for p in spec["photos"]} == {"masks/all.json"}
     dataset = read_dataset(folder / "data" / "mine")
     arguments = "photo", None, {}, folder / "pipeline.yaml"

@@ -17,6 +17,7 @@ from factorlib.dataset.schema import ExternalCamera, ObjectsSlice
 from factorlib.dataset.slices import dataset_slice
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.results.photos import PhotoFacts
+from tests.faults.sample import put
 from tests.refusal import refusal
 
 SIZE = 200, 150
@@ -33,12 +34,9 @@ OF_BOP = {"bop": "scene", "obj_ids": {"chair": 5}}
 
 @pytest.fixture
 def folder(tmp_path):
-    path = tmp_path / "set"
-    (path / "photos").mkdir(parents=True)
     for name in ("photos/hall.png", "photos/attic.png", "photos/000007.png", "mask.png", "chair.ply"):
-        (path / name).write_text("")
-    (tmp_path / "elsewhere").mkdir()
-    return path
+        put(tmp_path / "set" / name, "")
+    return tmp_path / "set"
 
 
 def read(folder, cameras, objects=(CHAIR,), names=PHOTOS, photo=None):
@@ -48,8 +46,7 @@ def read(folder, cameras, objects=(CHAIR,), names=PHOTOS, photo=None):
     photos[0] |= photo or {}
     meshes = {"chair": {"file": "chair.ply", "material": "red"}}
     spec = {"format": 1, "materials": ["red"], "meshes": meshes, "photos": photos, "cameras": cameras}
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(spec))
-    return read_dataset(folder)
+    return read_dataset(put(folder / "dataset.yaml", yaml.safe_dump(spec)).parent)
 
 
 def refused(folder, cameras, key, words, **options):
@@ -105,8 +102,7 @@ def test_lights_are_fixed_to_the_models_world_where_asked_for(folder):
     assert all(photo.world_from_camera is None for photo in read(folder, {"colmap": "sparse/0"}).spec.photos)
     fixed = {"colmap": "sparse/0", "world_from_camera": True}
     facts = dataset_slice(read(folder, fixed), "light", "hall").facts
-    toward = images["hall.png"].viewing_direction()  # of the world
-    assert np.allclose(np.array(facts["world_from_camera"]) @ [0, 0, 1], toward)
+    assert np.allclose(np.array(facts["world_from_camera"]) @ [0, 0, 1], images["hall.png"].viewing_direction())
     own = read(folder, fixed, photo={"world_from_camera": TURN.tolist()})
     assert np.allclose(own.spec.photos[0].world_from_camera, TURN)
     colmap(folder, names=("hall.png",))
@@ -154,13 +150,12 @@ FROM_X = np.column_stack([(0, 0, -1), (0, 1, 0), (1, 0, 0)])  # looks along −x
 
 
 def frame(path, rotation, centre, **lens):
-    rows = [[*row, c] for row, c in zip(np.array(rotation).tolist(), centre)]
+    rows = np.column_stack([rotation, centre]).tolist()
     return {"file_path": path, "transform_matrix": [*rows, [0, 0, 0, 1]], **lens}
 
 
 def transforms(folder, frames, lens=LENS):
-    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
-    return folder
+    return put(folder / "transforms.json", json.dumps({**lens, "frames": frames})).parent
 
 
 def test_what_is_right_and_up_of_an_opengl_camera_is_right_and_up_in_the_photo(folder):
@@ -248,9 +243,8 @@ GT = {"obj_id": 5, "cam_R_m2c": NINE, "cam_t_m2c": [0.0, 0.0, 1500.0]}
 
 
 def bop(folder, cameras=None, poses=None):
-    (folder / "scene").mkdir(exist_ok=True)
-    (folder / "scene/scene_camera.json").write_text(json.dumps(cameras or {"7": {"cam_K": K, "depth_scale": 1.0}}))
-    (folder / "scene/scene_gt.json").write_text(json.dumps(poses or {"7": [GT | {"obj_id": 2}, GT]}))
+    put(folder / "scene/scene_camera.json", json.dumps(cameras or {"7": {"cam_K": K, "depth_scale": 1.0}}))
+    put(folder / "scene/scene_gt.json", json.dumps(poses or {"7": [GT | {"obj_id": 2}, GT]}))
     return folder
 
 
@@ -280,8 +274,7 @@ EXTERNAL = ExternalCamera("colmap", 300.0, (104.0, 71.0), (200, 150), {})
 
 
 def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_and_another_is_refused():
-    sizes = (200, 150, 0), (400, 300, 0), (100, 75, 0), (67, 50, 0.5), (133, 100, 0.5)
-    for width, height, off in sizes:
+    for width, height, off in (200, 150, 0), (400, 300, 0), (100, 75, 0), (67, 50, 0.5), (133, 100, 0.5):
         focal, centre = convert_intrinsics(EXTERNAL, width, height, "hall")
         place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
         assert np.allclose(Camera(width, height, focal, centre).project(np.array([0.2, -0.1, 1.0])), place, atol=off)

@@ -112,12 +112,12 @@ def test_strangers_read_and_write_nothing(folder):
     with served(folder) as server:
         version = server.masks.version(1)
         of = {name: f"{name}:{server.server_port}" for name in ("localhost", "evil.example")}
-        strangers = [("X_Token", word) for word in (None, "", "guess", "\xfc")]
-        strangers += [("Host", word) for word in (None, "127.0.0.1", *of.values())]
-        strangers += [
-            ("Origin", word) for word in ("null", f"https://{server.host}", *(f"http://{k}" for k in of.values()))
-        ]
-        for name, word in strangers:
+        strangers = {
+            "X_Token": (None, "", "guess", "\xfc"),
+            "Host": (None, "127.0.0.1", *of.values()),
+            "Origin": ("null", f"https://{server.host}", *(f"http://{k}" for k in of.values())),
+        }
+        for name, word in [(name, word) for name, words in strangers.items() for word in words]:
             page = f"GET /?token={quote(word or '') if name == 'X_Token' else server.token}"
             for asks in (page, "GET /set", "GET /mask/1", "PUT /mask/1", "POST /unsaved/1"):
                 body = bytes(600) if "PUT" in asks else b"1"
@@ -162,9 +162,8 @@ def test_in_a_browser_by_mouse_and_keys(folder):
             page.keyboard.press(key)
             at = page.locator("canvas").first.bounding_box()
             scale = min(at["width"], at["height"]) / 60
-            left = at["x"] + at["width"] / 2
-            top = at["y"] + at["height"] / 2
-            places = [(left + (x - 30) * scale, top + (y - 30) * scale) for x, y in corners]
+            centre = np.array([at["x"] + at["width"] / 2, at["y"] + at["height"] / 2])
+            places = (centre + scale * (np.array(corners) - 30)).tolist()
             page.mouse.move(*places[0])
             page.mouse.down()
             page.mouse.move(*places[-1], steps=3)

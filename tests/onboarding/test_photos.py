@@ -35,6 +35,12 @@ from tests.shapes.outlines import CAMERA, looking_from, outline
 POSES = [looking_from(elevation, 45 * k) for k, elevation in enumerate([10, 40, -10, 30, 50, 0, 25, -25])]
 
 
+def cut_out(path, alpha):
+    """Write a grey photo that is transparent around a body."""
+    picture = np.dstack([np.full((*alpha.shape, 3), 120), 255 * alpha]).astype(np.uint8)
+    Image.fromarray(picture).save(put(path, ""))
+
+
 @pytest.fixture
 def cut_outs(tmp_path):
     """A folder with photos of a body in images/, transparent around it, and cameras without a focal length.
@@ -42,12 +48,10 @@ def cut_outs(tmp_path):
     One photo shows more than the body.
     """
     frames = []
-    (tmp_path / "capture" / "images").mkdir(parents=True)
     for number, pose in enumerate(POSES):
         alpha = rasterise(SHAPES["blob"](), CAMERA, pose).label > 0
         alpha[:, : 150 * (number == 5)] = True
-        picture = np.dstack([np.full((*alpha.shape, 3), 120), 255 * alpha]).astype(np.uint8)
-        Image.fromarray(picture).save(tmp_path / "capture" / "images" / f"{number}.png")
+        cut_out(tmp_path / "capture" / "images" / f"{number}.png", alpha)
         matrix = np.column_stack([pose.rotation.T * [1, -1, -1], -pose.rotation.T @ pose.translation])
         frames.append({"file_path": f"./images/{number}", "transform_matrix": matrix.tolist()})
     (tmp_path / "capture" / "transforms.json").write_text(json.dumps({"frames": frames}))
@@ -57,8 +61,9 @@ def cut_outs(tmp_path):
 @pytest.mark.long
 def test_cut_outs_with_poses_become_a_valid_dataset_with_a_hull_and_a_focal_length_without_a_click(cut_outs):
     steps = []
-    arguments = cut_outs / "capture", None, None, lambda share, text: steps.append(share)
-    missing, notes = dataset_from_photos(cut_outs / "mine", *arguments)
+    missing, notes = dataset_from_photos(
+        cut_outs / "mine", cut_outs / "capture", None, None, lambda share, text: steps.append(share)
+    )
     dataset = read_dataset(cut_outs / "mine")
     assert missing == [] and Validation(dataset).faults([("photo", None, {}, cut_outs)]) == []
     assert dataset.spec.meshes["thing"].hull and {photo.light for photo in dataset.spec.photos} == {"room"}
@@ -68,11 +73,8 @@ def test_cut_outs_with_poses_become_a_valid_dataset_with_a_hull_and_a_focal_leng
 
 @pytest.mark.parametrize("body, revolved", [("vase", True), ("blob", False)])
 def test_without_cameras_outlines_tell_whether_the_thing_is_a_body_of_revolution(tmp_path, body, revolved):
-    (tmp_path / "photos").mkdir()
     for number in (0, 2):
-        alpha = rasterise(SHAPES[body](), CAMERA, POSES[number]).label > 0
-        picture = np.dstack([np.full((*alpha.shape, 3), 120), 255 * alpha]).astype(np.uint8)
-        Image.fromarray(picture).save(tmp_path / "photos" / f"{number}.png")
+        cut_out(tmp_path / "photos" / f"{number}.png", rasterise(SHAPES[body](), CAMERA, POSES[number]).label > 0)
     missing, notes = dataset_from_photos(tmp_path / "mine", tmp_path / "photos", None, None, lambda share, text: None)
     assert (SHAPE in missing, REVOLVED in notes) == (not revolved, revolved)
     if revolved:
@@ -80,15 +82,10 @@ def test_without_cameras_outlines_tell_whether_the_thing_is_a_body_of_revolution
         assert dataset.spec.meshes["thing"].lathe and Validation(dataset).faults([("photo", None, {}, tmp_path)]) == []
 
 
-class Brightest:
+def brightest(pixels, size):
     """A network that takes the brightest thing of a picture for its foreground."""
-
-    def __init__(self, path=None):
-        pass
-
-    def __call__(self, pixels, size):
-        inside = pixels.mean(axis=2) > 0.9 * pixels.max()
-        return np.asarray(Image.fromarray(inside).resize(size[::-1])).astype(float), 1.0
+    inside = pixels.mean(axis=2) > 0.9 * pixels.max()
+    return np.asarray(Image.fromarray(inside).resize(size[::-1])).astype(float), 1.0
 
 
 def test_a_mask_of_another_thing_is_found_again_where_the_other_photos_show_the_body(cut_outs, monkeypatch):
@@ -103,7 +100,7 @@ def test_a_mask_of_another_thing_is_found_again_where_the_other_photos_show_the_
     cameras = cut_outs / "capture" / "transforms.json"
     lens = {"fl_x": CAMERA.focal, "w": CAMERA.width, "h": CAMERA.height}
     cameras.write_text(json.dumps(json.loads(cameras.read_text()) | lens))
-    monkeypatch.setattr("factorlib.onboarding.from_photos.MatteModel", Brightest)
+    monkeypatch.setattr("factorlib.onboarding.from_photos.MatteModel", lambda path: brightest)
     _, notes = dataset_from_photos(cut_outs / "mine", cut_outs / "capture", None, None, lambda share, text: None)
     for name, alpha in bodies.items():
         mask = np.asarray(Image.open(cut_outs / "mine" / "masks" / f"{name}.png")) > 0

@@ -12,6 +12,7 @@ from factorlib.recipe.read_recipe import files_of, read_recipe
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
+from tests.faults.sample import put
 from tests.refusal import refusal
 
 EAMES = LIBRARY / "data" / "eames"
@@ -25,9 +26,7 @@ def dataset():
 
 
 def written(folder: Path, text: str) -> Path:
-    path = folder / "one.yaml"
-    path.write_text(text)
-    return path
+    return put(folder / "one.yaml", text)
 
 
 def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survive_the_way_to_a_stage(dataset):
