@@ -152,8 +152,7 @@ def new_dataset(
         for photo in images
         if photo in RESERVED_PHOTOS
     ]
-    spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled)}
-    spec["photos"] = [photo | cameras.by_photo.get(photo["name"], {}) for photo in spec["photos"]]
+    spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled, cameras)}
     sources = {
         "photos": (photos, images.values()),
         "masks": (masks, mask_files),
@@ -183,12 +182,13 @@ def _visible_meshes(
     """Return the meshes that each photo shows, by the photo's name, else by the materials of its masks."""
     words = [(word, mesh) for mesh, entry in entries.items() for word in {mesh, *entry.get("parts", ())}]
     times = Counter(word for word, _ in words)
-    mesh_of = dict(words)
     visible = {}
     for photo in photos:
         masks = labelled.by_photo.get(photo)
-        shown = {mesh_of[word] for word in masks if times[word] == 1} if isinstance(masks, dict) else ()
-        visible[photo] = _meshes_named_in(photo, entries) or sorted(shown)
+        materials = masks if isinstance(masks, dict) else ()
+        visible[photo] = _meshes_named_in(photo, entries) or sorted(
+            {mesh for word, mesh in words if word in materials and times[word] == 1}
+        )
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in photos if not visible[photo]]
     return visible
@@ -201,7 +201,11 @@ def _shape(materials: list[str], cameras: Cameras) -> dict[str, Any]:
 
 
 def _photo_entries(
-    paths: Mapping[str, str], entries: Collection[str], visible: Mapping[str, list[str]], labelled: Masks
+    paths: Mapping[str, str],
+    entries: Collection[str],
+    visible: Mapping[str, list[str]],
+    labelled: Masks,
+    cameras: Cameras,
 ) -> list[dict[str, Any]]:
     """Return `photos` of the dataset.yaml: each photo's picture, masks and objects."""
     photos = []
@@ -211,8 +215,8 @@ def _photo_entries(
             only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
             mesh_of = {name: (_meshes_named_in(name, entries) or [only])[0] for name in silhouettes}
             objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes.items()]
-        mask = labelled.by_photo.get(photo, UNKNOWN)
-        photos.append({"name": photo, "image": path, "masks": mask, "objects": objects})
+        entry = {"name": photo, "image": path, "masks": labelled.by_photo.get(photo, UNKNOWN), "objects": objects}
+        photos.append(entry | cameras.by_photo.get(photo, {}))
     return photos
 
 
@@ -258,25 +262,22 @@ def _masks(
     if sources := [path for path in paths if path.suffix.lower() not in MASK_IMAGES]:
         by_file = {path: next((photo_of[tail] for tail in tails[path] if tail in photo_of), None) for path in paths}
         return _annotated_masks(file, sources, by_file, list(photos), missing)
-    labels = 0
-    names: dict[str, None] = {}
-    outlines = []
     masks = Masks()
+    labels: dict[str, set[int]] = {}  # by photo
     whole, further = (beside, {}) if beside else _masks_by_photo(tails, photo_of)
     for photo in photos:
         each = {name: file[path] for name, path in sorted(further.get(photo, {}).items())}
         if photo in whole:
             check_values(whole[photo], key=photo)
-            values = read_labels_in(whole[photo], photo)
-            labels = max([labels, *values])
-            outlines += [photo] * (not values)
+            labels[photo] = read_labels_in(whole[photo], photo)
             masks.by_photo[photo] = file[whole[photo]]
             masks.silhouettes[photo] = each
         elif each:
             masks.by_photo[photo] = each
-            names |= dict.fromkeys(each)
-    masks.materials = list(names) or [f"label_{k}" for k in range(1, max(labels, bool(outlines)) + 1)]
-    _name_outlines(masks, outlines, missing)
+    names = [name for each in masks.by_photo.values() if isinstance(each, dict) for name in each]
+    most = max((label for values in labels.values() for label in values or {1}), default=0)
+    masks.materials = list(dict.fromkeys(names)) or [f"label_{k}" for k in range(1, most + 1)]
+    _name_outlines(masks, [photo for photo, values in labels.items() if not values], missing)
     return masks
 
 

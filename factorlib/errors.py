@@ -36,8 +36,7 @@ class InputError(ValueError):
 
     def __str__(self) -> str:
         location = "".join(f"{part}: " for part in (self.file, self.key) if part is not None)
-        cure = f"\n  {self.cure}" if self.cure else ""
-        return f"{location}{self.fault}{cure}"
+        return f"{location}{self.fault}" + (f"\n  {self.cure}" if self.cure else "")
 
     def __reduce__(self) -> tuple:  # for pickling in a worker process
         return partial(InputError, self.fault, file=self.file, key=self.key, cure=self.cure), ()
@@ -84,8 +83,8 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
     word = word.strip("[]'\"")
     composed = unicodedata.normalize("NFC", word)
     compared = [k for k in known[:MOST_COMPARED] if unicodedata.normalize("NFC", k) != composed]
-    same_initial = [k for k in compared if k[:1] == word[:1]]
     near = [k for k in compared if unicodedata.normalize("NFC", k).casefold() == composed.casefold()]
-    near = near or get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, same_initial, 1)
+    near = near or get_close_matches(word, compared, 1, NEAR)
+    near = near or get_close_matches(word, [k for k in compared if k[:1] == word[:1]], 1)
     more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""
     return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known[:MOST_LISTED])) + more

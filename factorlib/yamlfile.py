@@ -107,8 +107,11 @@ def _compose(text: str, name: str | Path) -> yaml.Node | None:
         mark = getattr(error, "problem_mark", None)
         words = [getattr(error, part, None) for part in ("context", "problem")]
         fault = ": ".join(one_line(part) for part in words if part) or one_line(str(error))
-        cure = "look on or above this line for a bracket, quote, colon, indent, or alias (*name) without anchor"
-        raise InputError(f"not YAML: {fault}", file=f"{name}:{mark.line + 1}" if mark else name, cure=cure) from error
+        raise InputError(
+            f"not YAML: {fault}",
+            file=f"{name}:{mark.line + 1}" if mark else name,
+            cure="look on or above this line for a bracket, quote, colon, indent, or alias (*name) without anchor",
+        ) from error
 
 
 def _parse(text: str, name: str | Path, most_values: int) -> tuple[Any, dict[Keys, int]]:

@@ -267,7 +267,7 @@ def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusa
 
 
 def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
-    """Check that known materials occur on objects, and reflect some light but no more than arrives."""
+    """Check known materials, exposures and lights."""
     used = {m for photo in spec.photos for obj in photo.objects for m in instance_materials(obj, spec)}
     for name, reflectance in spec.known.materials.items():
         refuse.collect(_check_known_material, name, reflectance, used, spec, refuse)
@@ -280,6 +280,7 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
 def _check_known_material(
     name: str, reflectance: KnownMaterial, used: set[str], spec: DatasetFile, refuse: Refusal
 ) -> None:
+    """Check that a known material occurs on an object, and reflects some light but no more than arrives."""
     key = f"known.materials.{name}"
     specular = reflectance.specular or (0.0, 0.0, 0.0)
     refuse.check_known(key, name, spec.materials, "material")

@@ -7,6 +7,7 @@ import os
 import stat
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, NoReturn
 
@@ -201,11 +202,9 @@ class Refusal:
         """
         above, _, name = path.rpartition("/")
         plain_name = name not in ("", ".", "..")
-        try:
+        with suppress(OSError, ValueError):  # reported below
             if plain_name and above in self.inside and stat.S_ISREG(os.lstat(self.inside[above] / name).st_mode):
                 return self.inside[above] / name
-        except (OSError, ValueError):
-            pass  # reported below
         try:
             target = path_inside(self.folder, path)
             if above and plain_name:

@@ -89,11 +89,6 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
     return facts, files + _object_masks(photo)
 
 
-def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
-    photos = [photo.name for photo in dataset.spec.photos]
-    return schema.SetSlice(dataset.name, dataset.spec.materials, dataset.spec.meshes, photos), []
-
-
 def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
     known = dataset.spec.known
     balls = {}
@@ -146,7 +141,12 @@ _PHOTO_SLICES: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]]
 }
 _SET_SLICES: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
     "materials": lambda dataset: (dataset.spec.materials, []),
-    "set": _set,
+    "set": lambda dataset: (
+        schema.SetSlice(
+            dataset.name, dataset.spec.materials, dataset.spec.meshes, [photo.name for photo in dataset.spec.photos]
+        ),
+        [],
+    ),
     "shapes": _shapes,
     "known": _known,
     "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),

@@ -149,10 +149,10 @@ class MaskSet:
         """Return dataset.yaml with the mask's path in place of the photo's `?`, or None if there is no `?`."""
         text = read_text(self.yaml, "a YAML file")
         mask = f"masks/{photo}.png"
-        photos = read_yaml(self.yaml, LabelledSet).photos
-        index = next((k for k, each in enumerate(photos) if (each.name, each.masks) == (photo, UNKNOWN)), None)
-        if index is None:
+        photos = [(each.name, each.masks) for each in read_yaml(self.yaml, LabelledSet).photos]
+        if (photo, UNKNOWN) not in photos:
             return None
+        index = photos.index((photo, UNKNOWN))
         value = parse_yaml(text)
         text = with_value(text, ("photos", index, "masks"), mask)
         value["photos"][index]["masks"] = mask

@@ -103,10 +103,8 @@ def _walk(
     """
     number = np.arange(label.size).reshape(label.shape)
     colour = pixels.reshape(-1, 3)
-    edges = []
-    for start, end in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        edges.append((number[start].ravel(), number[end].ravel()))
-    first, second = np.concatenate(edges, axis=1)
+    first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+    second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
     # L, with weights that fall with the difference of colours between neighbours
     step = np.square(colour[first] - colour[second]).sum(axis=1)
     weight = np.exp(-step / max(2 * step.mean(), 1e-12)) + CROSSING
@@ -125,10 +123,12 @@ def _walk(
     learnt = known if np.isin(kinds, current[known]).all() else np.ones_like(known)
     for _ in range(ROUNDS):
         # p from the histograms of colours, then (L + γ) x = γ p for each label
-        histograms = [
-            _histogram(bins[learnt & (current == kind)]) + GUESSED * _histogram(bins[current == kind]) for kind in kinds
-        ]
-        prior = np.array(histograms)[:, bins]
+        prior = np.array(
+            [
+                _histogram(bins[learnt & (current == kind)]) + GUESSED * _histogram(bins[current == kind])
+                for kind in kinds
+            ]
+        )[:, bins]
         prior /= prior.sum(axis=0)
         for k, kind in enumerate(kinds):
             chances[k, known] = current[known] == kind

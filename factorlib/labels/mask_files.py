@@ -153,9 +153,11 @@ def read_colours(
 def read_labelmap(path: Path) -> dict[int, str]:
     """Return the names in a labelmap.txt of CVAT by their colours, 0xRRGGBB."""
     lines = read_text(path, "a labelmap", None, MOST_BYTES).splitlines()
-    rows = [line.split(":") for line in lines if line.strip() and not line.startswith("#")]
     with reading("a labelmap", path, cure="its lines are name:red,green,blue::"):
-        return {int.from_bytes(bytes(map(int, colour.split(",")))): name for name, colour, *_ in rows}
+        return {
+            int.from_bytes(bytes(map(int, colour.split(",")))): name
+            for name, colour, *_ in (line.split(":") for line in lines if line.strip() and not line.startswith("#"))
+        }
 
 
 class _Picture(msgspec.Struct, frozen=True):
@@ -354,8 +356,6 @@ def read_annotations(path: str | Path, image: str = "", key: str | None = None) 
             if b'"annotations"' not in content and b'"shapes"' in content:
                 raise
             return msgspec.json.decode(content, type=Coco)
-        images = [CocoImage(0, image, labelme.imageWidth, labelme.imageHeight)]
-        names = dict.fromkeys(shape.label for shape in labelme.shapes)
         for k, shape in enumerate(labelme.shapes):
             if shape.shape_type not in SHAPES:
                 raise InputError(
@@ -364,8 +364,11 @@ def read_annotations(path: str | Path, image: str = "", key: str | None = None) 
                     key=f"shapes[{k}].shape_type",
                     cure="draw its outline, or delete it",
                 )
-        annotations = [Annotation(0, shape.label, msgspec.Raw(_segmentation(shape))) for shape in labelme.shapes]
-        return LabelmeCoco(images, annotations, [Category(name, name) for name in names])
+        return LabelmeCoco(
+            [CocoImage(0, image, labelme.imageWidth, labelme.imageHeight)],
+            [Annotation(0, shape.label, msgspec.Raw(_segmentation(shape))) for shape in labelme.shapes],
+            [Category(name, name) for name in dict.fromkeys(shape.label for shape in labelme.shapes)],
+        )
 
 
 def _segmentation(shape: LabelmeShape) -> bytes:

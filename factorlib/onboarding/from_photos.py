@@ -118,11 +118,14 @@ def dataset_from_photos(
         views, outlines = refine_masks(
             views, outlines, model, folder, lambda share, text: report(0.9 + share / 10, text)
         )
-        doubts = doubtful_masks(views, outlines)
         if unknown := not cameras.source and not meshes:
             cameras = outlined_shape(visible, report)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
-    return missing + [SHAPE] * (unknown and not cameras.revolved), [NAMES, *cameras.notes, *doubts]
+    return missing + [SHAPE] * (unknown and not cameras.revolved), [
+        NAMES,
+        *cameras.notes,
+        *doubtful_masks(views, outlines),
+    ]
 
 
 def read_views(

@@ -18,7 +18,6 @@ from factorlib.errors import InputError
 from factorlib.labels.mask_files import opaque_part
 from factorlib.reading import reading
 
-WITHOUT = "make setup EXTRAS=masks, or name a model with MATTE=<file.onnx>; or use photos with an alpha channel"
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of ImageNet's colours, by which models are trained
 DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 SIDE = 320  # side of the input of a model that does not state it, pixels
@@ -68,7 +67,12 @@ class MatteModel:
     def __init__(self, path: Path | None = None):
         package = find_spec("rembg")  # the package of the extra `masks`
         if find_spec("onnxruntime") is None or (path is None and (package is None or package.origin is None)):
-            raise InputError("automatic masks need a network, which is not installed", key="MATTE", cure=WITHOUT)
+            raise InputError(
+                "automatic masks need a network, which is not installed",
+                key="MATTE",
+                cure="make setup EXTRAS=masks, or name a model with MATTE=<file.onnx>; "
+                "or use photos with an alpha channel",
+            )
         import onnxruntime
 
         options = onnxruntime.SessionOptions()

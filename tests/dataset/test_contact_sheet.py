@@ -24,5 +24,8 @@ def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_
     unfinished = read_png(sheet)
     assert len(unfinished) == len(read_png(tmp_path / "again.png")) + HEAD and (unfinished != 255).any()
     (tmp_path / "again.png").replace(sheet)
-    height = 2 * HEAD + 2 * MARGIN + 2 * (MESH_SIDE + HEAD + MARGIN)
-    assert read_png(sheet).shape == (height, 2 * (sample.W + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)
+    assert read_png(sheet).shape == (
+        2 * HEAD + 2 * MARGIN + 2 * (MESH_SIDE + HEAD + MARGIN),
+        2 * (sample.W + MARGIN) + 2 * (MESH_SIDE + MARGIN),
+        3,
+    )

@@ -164,10 +164,10 @@ def drawn_chair(folder, *labels, solid=LAMP):
     """Photos of a chair from several sides, with a mask each: labels of shell and legs."""
     for path in [*(folder / "photos").iterdir(), *(folder / "meshes").iterdir()]:
         path.unlink()
-    text, start = "", 1
-    for part, mesh in (("shell", solid.faces[solid.face_label == 1]), ("legs", solid.faces[solid.face_label == 2])):
-        text += f"g {part}\n" + "".join("f {} {} {}\n".format(*(face + start)) for face in mesh)
-    text = "".join("v {} {} {}\n".format(*vertex) for vertex in solid.vertices) + text
+    text = "".join("v {} {} {}\n".format(*vertex) for vertex in solid.vertices)
+    for label, part in ((1, "shell"), (2, "legs")):
+        faces = solid.faces[solid.face_label == label] + 1
+        text += f"g {part}\n" + "".join("f {} {} {}\n".format(*face) for face in faces)
     (folder / "meshes" / "chair.obj").write_text(text)
     for k, of in enumerate(labels):
         label = silhouette_of(LAMP, of, k).label.astype(np.uint8)
@@ -188,20 +188,22 @@ def test_parts_get_the_materials_that_silhouettes_tell_and_objects_those_that_di
     stripes = np.resize(np.array([1, 2, 3], np.uint8), (90, 120))  # of more materials than the chair has parts
     Image.fromarray(stripes).save(folder / "masks" / "p2.png")
     missing, spec = made(folder)
-    materials = [photo["objects"][0].get("materials") for photo in spec["photos"]]
-    assert materials == [None, None, {"shell": "?", "legs": "?"}]
+    assert [photo["objects"][0].get("materials") for photo in spec["photos"]] == [
+        None,
+        None,
+        {"shell": "?", "legs": "?"},
+    ]
     assert missing[0] == "photo p2: write which material shell of chair is made of"
 
 
 def test_what_silhouettes_do_not_tell_is_open_and_what_it_may_be_stands_beside_it(folder):
     drawn_chair(folder, (1, 3), solid=TWINS)
-    mask = np.zeros((90, 120), np.uint8)
-    mask[30:60, 30:60], mask[30:60, 60:90] = 1, 3
+    mask = np.pad(np.repeat(np.uint8([[1, 3]]), 30, axis=1).repeat(30, axis=0), 30)
     Image.fromarray(mask).save(folder / "masks" / "p0.png")
     missing, spec = made(folder)
     assert spec["meshes"]["chair"]["parts"] == {"shell": "?", "legs": "?"} and len(missing) == 2
-    text = (folder / "data" / "mine" / "dataset.yaml").read_text()
-    assert re.search(r'shell: "\?"  # label_[13] or label_[13]$', text, re.MULTILINE)
+    file = folder / "data" / "mine" / "dataset.yaml"
+    assert re.search(r'shell: "\?"  # label_[13] or label_[13]$', file.read_text(), re.MULTILINE)
 
 
 def test_an_object_is_of_the_mesh_that_its_mask_names(folder):
@@ -209,8 +211,10 @@ def test_an_object_is_of_the_mesh_that_its_mask_names(folder):
     (folder / "meshes" / "stool.obj").write_text(OBJ.replace("shell", "seat").replace("legs", "feet"))
     masks(folder, kitchen=LABEL, kitchen_old_stool=[0, 1, 0], kitchen_chair=[0, 0, 1])
     _, spec = made(folder)
-    meshes = {obj["name"]: obj["mesh"] for obj in spec["photos"][1]["objects"]}
-    assert meshes == {"old_stool": "stool", "chair": "chair"}
+    assert {obj["name"]: obj["mesh"] for obj in spec["photos"][1]["objects"]} == {
+        "old_stool": "stool",
+        "chair": "chair",
+    }
     shutil.rmtree(folder / "data")
     shutil.rmtree(folder / "masks")
     masks(folder, kitchen_seat=SHELL, IMG_0412_shell=SHELL)

@@ -17,6 +17,7 @@ from PIL import Image
 from factorlib.labelling.server import MaskSet, Server
 from factorlib.labels.mask_files import read_values
 from tests.browser import CHROMIUM, started
+from tests.faults.sample import put
 from tests.labels.test_label_image import scene
 from tests.refusal import refusal
 
@@ -35,8 +36,7 @@ photos:
 @pytest.fixture
 def folder(tmp_path):
     """An unfinished data set: the photo `day` has no mask yet; `side` has one, and is displayed turned, for its EXIF says so."""
-    (folder := tmp_path / "set").mkdir()
-    write(folder, YAML)
+    folder = put(tmp_path / "set" / "dataset.yaml", YAML).parent
     Image.fromarray(scene()[1]).save(folder / "day.png")
     (turned := Image.Exif())[0x0112] = 6
     Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(folder / "side.jpg", exif=turned)
@@ -44,20 +44,14 @@ def folder(tmp_path):
     return folder
 
 
-def write(folder, text):
-    (folder / "dataset.yaml").write_text(text, encoding="utf-8")
-
-
 @contextmanager
 def served(folder):
-    server = Server(MaskSet(folder))
-    (thread := Thread(target=server.serve_forever)).start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with Server(MaskSet(folder)) as server:
+        Thread(target=server.serve_forever).start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
 
 
 def asked(server, method, path, body=b"", **headers):
@@ -90,7 +84,7 @@ def test_masks_are_of_the_photo_as_displayed_and_saved_whole(folder):
         refusal(fault, masks.save, 1, labels, of)
     assert np.array_equal(masks.read(1)[0], given * 2)
     shared = YAML.replace('"?", objects', '&m "?", objects').replace("given.png", "*m")
-    write(folder, shared)
+    put(folder / "dataset.yaml", shared)
     refusal("has an anchor", masks.save, 0, drawn, masks.version(0))
     assert (folder / "dataset.yaml").read_text(encoding="utf-8") == shared
 
@@ -101,7 +95,7 @@ def test_masks_are_of_the_photo_as_displayed_and_saved_whole(folder):
      ("[red, brown]", '["?"]'), ("given.png", "coco.json"), ("given.png", "{red: given.png}")],
 )  # fmt: skip
 def test_what_leads_outside_or_has_no_name_is_refused(folder, old, new):
-    write(folder, YAML.replace(old, new))
+    put(folder / "dataset.yaml", YAML.replace(old, new))
     caught = refusal(".", MaskSet, folder)
     assert caught.cure and caught.key
 
@@ -147,7 +141,8 @@ def test_ctrl_c_ends_it_and_names_what_is_not_saved(folder):
 @pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason=WHY)
 def test_in_a_browser_by_mouse_and_keys(folder):
-    truth, box, mask = scene()[0], scene()[2], folder / "masks/day.png"
+    truth, _, box = scene()
+    mask = folder / "masks/day.png"
     with served(folder) as server:
         context = started().new_context(viewport={"width": 1440, "height": 900})
         page, complaints = context.new_page(), []

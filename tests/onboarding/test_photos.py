@@ -157,8 +157,8 @@ def test_each_photo_has_its_own_mask_and_neither_masks_nor_copies_nor_depth_are_
 
 
 def test_wrong_cameras_are_named_by_their_own_file_also_where_the_focal_length_is_missing(tmp_path):
-    frames = [{"file_path": "7.jpg", "transform_matrix": [[0, 0, 0, 0]] * 3}]
-    file = put(tmp_path / "transforms.json", json.dumps({"frames": frames}))
+    frame = {"file_path": "7.jpg", "transform_matrix": [[0, 0, 0, 0]] * 3}
+    file = put(tmp_path / "transforms.json", json.dumps({"frames": [frame]}))
     cameras = Cameras({"transforms": "cameras/transforms.json"}, tmp_path, [file])
     assert refusal("not a rotation", cameras_of_folder, {}, {}, cameras, tmp_path, None).file == file
 
@@ -173,10 +173,11 @@ def test_a_mask_beside_a_photo_is_its_labels_or_a_matte_cut_at_half(tmp_path, to
         assert np.asarray(Image.open(tmp_path / "masks" / "a.png")).tolist() == [inside] * 2
 
 
-def test_a_tiff_of_floats_has_no_alpha_and_one_that_hides_nothing_is_none(tmp_path):
+def test_a_photo_without_alpha_prints_nothing_and_one_that_hides_nothing_has_none(tmp_path, capfd):
     save(tmp_path / "a.tif", np.ones((2, 4, 3), np.float32))
     save(tmp_path / "b.tif", np.full((2, 4, 4), 65000, np.uint16), ["R", "G", "B", "A"])
-    assert opaque_pixels(tmp_path / "a.tif") is None and opaque_pixels(tmp_path / "b.tif") is None
+    files = tmp_path / "a.tif", tmp_path / "b.tif", CHECKOUT / "data/eames/photos/hall.jpg"
+    assert list(map(opaque_pixels, files)) == [None] * 3 and capfd.readouterr() == ("", "")
 
 
 def test_a_lens_that_two_coefficients_describe_is_a_camera_and_a_fisheye_is_none():
@@ -193,11 +194,6 @@ def test_cameras_at_one_place_tell_no_focal_length_and_no_doubt():
     same = [outline(SHAPES["blob"](), POSES[0], True)] * 3
     assert doubtful_masks({}, same) == []
     refusal("no focal length", focal_by_hull, lambda focal: same, 300)
-
-
-def test_a_photo_without_alpha_prints_nothing(capfd):
-    assert opaque_pixels(CHECKOUT / "data/eames/photos/hall.jpg") is None
-    assert capfd.readouterr() == ("", "")
 
 
 def test_without_the_network_the_error_has_the_command(monkeypatch):

@@ -17,6 +17,7 @@ from factorlib.dataset.schema import (
     CameraSource,
     DatasetFile,
     ExternalCamera,
+    MeshEntry,
     PhotoEntry,
     RigidTransform,
     Similarity,
@@ -61,21 +62,21 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
                 photo.name,
             )
         else:
-            hulls = {obj.name for obj in photo.objects if spec.meshes[obj.mesh].hull}
-            poses = _poses(photo, image, source, hulls, refuse)
+            poses = _poses(photo, image, source, spec.meshes, refuse)
             intrinsics = photo.camera
             if intrinsics is not None and intrinsics.focal_px is not None and intrinsics.principal_point is not None:
-                camera = ExternalCamera(kind, intrinsics.focal_px, intrinsics.principal_point, None, poses)
+                external[photo.name] = ExternalCamera(
+                    kind, intrinsics.focal_px, intrinsics.principal_point, None, poses
+                )
             else:
                 focal, centre = pinhole(image.camera, image.key, refuse)
-                camera = ExternalCamera(
+                external[photo.name] = ExternalCamera(
                     kind,
                     focal if image.focal_known else None,
                     None if image.centred else centre,
                     image.size,
                     poses,
                 )
-            external[photo.name] = camera
             if source.world_from_camera and photo.world_from_camera is None:
                 assert image.cam_from_world is not None  # world_from_camera does not go with bop, which has no world
                 world_from_camera = as_rows(image.cam_from_world.inverse().rotation)
@@ -144,11 +145,11 @@ def _patterns(photo: str) -> list[list[tuple]]:
 
 
 def _poses(
-    photo: PhotoEntry, image: SourceImage, source: CameraSource, hulls: set[str], refuse: Refusal
+    photo: PhotoEntry, image: SourceImage, source: CameraSource, meshes: Mapping[str, MeshEntry], refuse: Refusal
 ) -> dict[str, RigidTransform]:
     """Return poses by object, for objects that the source places and dataset.yaml does not.
 
-    Objects in `hulls` are in the source's frame unless it says otherwise.
+    Hulls are in the source's frame unless it says otherwise.
     """
     objects = [obj for obj in photo.objects if obj.pose is None and not obj.keypoints]
     poses = {}
@@ -174,7 +175,7 @@ def _poses(
             for pose in instances:
                 poses[obj.name] = RigidTransform(pose.rotation, _divide(pose.translation, source.mesh_unit_mm))
         return poses
-    similarities = {name: Similarity() for name in hulls} | source.world_from_object
+    similarities = {obj.name: Similarity() for obj in objects if meshes[obj.mesh].hull} | source.world_from_object
     placed = {obj.name: similarities[obj.name] for obj in objects if obj.name in similarities}
     scales = sorted({similarity.scale for similarity in placed.values()})
     refuse.refuse_if(
