@@ -131,12 +131,7 @@ def new_dataset(
     labelled = _masks(masks, mask_files, paths, beside, missing) if masks else _cut_outs(paths, images, missing)
     entries = _meshes(meshes, mesh_files, labelled.materials) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
-    unmasked = [
-        f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
-        for photo in images
-        if photo not in labelled.by_photo
-    ]
-    missing += unmasked if masks or labelled.by_photo else [NO_MASKS]
+    missing += _open_masks(images, labelled, masks is not None)
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
         missing += [] if cameras or source else [NO_MESH]
@@ -145,24 +140,32 @@ def new_dataset(
         visible = {photo: [HULL] for photo in images}
     cameras = cameras or source or Cameras()
     spec |= {"cameras": cameras.source} if cameras.source else {}
-    if masks and not labelled.materials:
-        missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
-    missing += [
-        f"photo {photo}: write another `name`: a file of the results is called {photo}"
-        for photo in images
-        if photo in RESERVED_PHOTOS
-    ]
     spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled, cameras)}
-    sources = {
-        "photos": (photos, images.values()),
-        "masks": (masks, mask_files),
-        "meshes": (meshes, mesh_files),
-        "cameras": (cameras.folder, cameras.files),
-    }
+    sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
+    sources["cameras"] = cameras.folder, cameras.files
     places = {name: (folder, files) for name, (folder, files) in sources.items() if folder}
     _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     _write(target, spec, places, above)
     return missing
+
+
+def _open_masks(photos: Iterable[str], labelled: Masks, are_given: bool) -> list[str]:
+    """Name the photos without a mask, masks without a material, and photos that must have another name."""
+    unmasked = [
+        f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
+        for photo in photos
+        if photo not in labelled.by_photo
+    ]
+    return [
+        *(unmasked if are_given or labelled.by_photo else [NO_MASKS]),
+        *["no mask names a material: write the names in `materials`, label k of a mask the k-th"]
+        * (are_given and not labelled.materials),
+        *(
+            f"photo {photo}: write another `name`: a file of the results is called {photo}"
+            for photo in photos
+            if photo in RESERVED_PHOTOS
+        ),
+    ]
 
 
 def check_target(target: Path) -> Path:

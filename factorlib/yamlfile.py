@@ -150,12 +150,8 @@ def _parse(text: str, name: str | Path, most_values: int) -> tuple[Any, dict[Key
                 refuse("a key is a list or a map, not a word", word, keys, "write key: value")
             below = (*keys, word.value)
             if word.value in values:
-                refuse(
-                    f"the key {one_line(repr(word.value))} occurs twice, first on line {lines[below]}",
-                    word,
-                    below,
-                    "delete or rename one of them",
-                )
+                fault = f"the key {one_line(repr(word.value))} occurs twice, first on line {lines[below]}"
+                refuse(fault, word, below, "delete or rename one of them")
             lines[below] = word.start_mark.line + 1
             values[word.value] = plain(item, below)
         return values

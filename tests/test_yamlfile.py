@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorlib.yamlfile import load_yaml, parse_yaml, read_yaml
+from tests.faults.sample import put
 from tests.refusal import refusal
 
 
@@ -44,8 +45,8 @@ def test_every_float_that_python_writes_comes_back(number):
 
 
 def test_a_good_file(tmp_path):
-    file = tmp_path / "x.yaml"
-    file.write_text("ratio: 1e-3\ntable: {a: &one {size: 2}, b: *one}\nrows: [{size: 1, name: no}]\n")
+    text = "ratio: 1e-3\ntable: {a: &one {size: 2}, b: *one}\nrows: [{size: 1, name: no}]\n"
+    file = put(tmp_path / "x.yaml", text)
     assert read_yaml(file, Outer) == Outer(0.001, {"a": Inner(2), "b": Inner(2)}, [Inner(1, "no")])
     assert load_yaml(file)["table"]["b"] == {"size": 2}
 
@@ -71,13 +72,11 @@ def test_a_good_file(tmp_path):
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_with_its_place(tmp_path, text, line, key, words):
-    (tmp_path / "x.yaml").write_text(text)
-    error = refusal(".", read_yaml, tmp_path / "x.yaml", Outer)
+    error = refusal(".", read_yaml, put(tmp_path / "x.yaml", text), Outer)
     assert (str(error.file), error.key) == (f"{tmp_path}/x.yaml:{line}", key)
     assert words in str(error)
 
 
 def test_files_that_cannot_be_read(tmp_path):
     refusal("cannot be read", read_yaml, tmp_path / "none.yaml", Outer)
-    (tmp_path / "x.yaml").write_bytes(b"ratio: \xff")
-    refusal("UTF-8", read_yaml, tmp_path / "x.yaml", Outer)
+    refusal("UTF-8", read_yaml, put(tmp_path / "x.yaml", b"ratio: \xff"), Outer)

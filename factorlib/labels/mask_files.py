@@ -421,12 +421,8 @@ def read_coco(
             fault = f"category_id is {annotation.category_id!r}, but categories has no such id"
             raise InputError(fault, file=path, key=f"annotations[{index}]", cure="add it, or correct category_id")
         if name not in materials:
-            raise InputError(
-                f"category {name!r} is not a material",
-                file=path,
-                key=place.partition(".")[0],
-                cure=did_you_mean(name, materials) + " (categories are the dataset's materials)",
-            )
+            cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
+            raise InputError(f"category {name!r} is not a material", file=path, key=place.partition(".")[0], cure=cure)
         segmentations.setdefault(name, []).append((place, annotation.segmentation))
     masks = {}
     length = 0.0  # of all outlines

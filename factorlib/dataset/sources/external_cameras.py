@@ -70,13 +70,8 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
                 )
             else:
                 focal, centre = pinhole(image.camera, image.key, refuse)
-                external[photo.name] = ExternalCamera(
-                    kind,
-                    focal if image.focal_known else None,
-                    None if image.centred else centre,
-                    image.size,
-                    poses,
-                )
+                known = focal if image.focal_known else None
+                external[photo.name] = ExternalCamera(kind, known, None if image.centred else centre, image.size, poses)
             if source.world_from_camera and photo.world_from_camera is None:
                 assert image.cam_from_world is not None  # world_from_camera does not go with bop, which has no world
                 world_from_camera = as_rows(image.cam_from_world.inverse().rotation)
@@ -117,13 +112,8 @@ def match_images(
             continue
         matches = ([image for pattern in each for image in by_pattern.get(pattern, [])] for each in _patterns(place))
         candidates = next(filter(None, matches), [])
-        names = ", ".join(repr(image.name) for image in candidates[:3])
-        refuse.refuse_if(
-            len(candidates) > 1,
-            key,
-            f"{place!r} matches several images of the source: {names}",
-            f"choose one: cameras.images: {{{photo}: …}}",
-        )
+        fault = f"{place!r} matches several images of the source: {', '.join(repr(i.name) for i in candidates[:3])}"
+        refuse.refuse_if(len(candidates) > 1, key, fault, f"choose one: cameras.images: {{{photo}: …}}")
         if candidates:
             result[photo] = candidates[0]
     examples = ", ".join(repr(image.name) for image in images[:3]) or "none at all"

@@ -106,17 +106,14 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         not (all(FOCAL_PX[0] <= f <= FOCAL_PX[1] for f in focals) and max(map(abs, centre)) <= CENTRE_PX),
         key,
         f"its focal length {focals[0]:g} px or principal point ({centre[0]:g}, {centre[1]:g}) is implausible",
-        f"focal lengths are {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, principal points up to {CENTRE_PX:g} px away; "
-        f"{DAMAGED}",
+        f"focal lengths are {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, principal points up to {CENTRE_PX:g} px; {DAMAGED}",
     )
-    # a fisheye's projection is no pinhole's, even with all parameters 0
-    undistorted = camera.is_undistorted() and "FISHEYE" not in camera.model_name
+    undistorted = camera.is_undistorted() and "FISHEYE" not in camera.model_name  # no pinhole even with zeros
     if undistorted and focals[0] == focals[1]:
         return float(focals[0]), centre
     pixels = [[camera.width * i / (GRID - 1), camera.height * j / (GRID - 1)] for i in range(GRID) for j in range(GRID)]
     places = pixels - camera.calibration_matrix()[:2, 2]  # an array, as pycolmap's are
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # for pixels without a ray, which are rejected below
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of pixels without a ray, rejected below
         # least-squares focal length of pixel offset over slope, and the largest residual
         slopes = camera.cam_from_img(pixels)
         assert slopes is not None  # as of a single point; rows of many points are NaN
@@ -127,8 +124,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
     refuse.refuse_if(
         not error <= MOST_OFF_PX,  # NaN where a pixel has no ray
         key,
-        f"the camera's {cause}: it differs from a pinhole of one focal length {extent}; "
-        f"at most {MOST_OFF_PX} px is allowed",
+        f"the camera's {cause}: it differs from a pinhole of one focal length {extent} (allowed: {MOST_OFF_PX} px)",
         "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
         "or resample photos and masks to square pixels"
         if undistorted
