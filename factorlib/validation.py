@@ -31,6 +31,7 @@ from factorlib.yamlfile import convert
 
 log = logging.getLogger("factorlib.validation")
 Check = Callable[[], object]
+AT_ONCE = 8  # number of photos that are open, and perhaps decoded as a whole, together
 NOT_ROUND = 0.02  # largest variation of a ball's radius, relative
 
 
@@ -44,21 +45,29 @@ class Validation:
         self._done: set[str] = set()
         self._parts = cache(read_parts)
         self._pixels: list[Check] = []
+        self._seen: set[int] = set()  # labels in masks
 
     def faults(self, requests: Iterable[tuple[str, str | None, dict[str, Any], Path]]) -> list[InputError]:
         """Return the faults of the files that slices name, except those checked before.
 
         A request is the name of a slice; that of a photo, or None for all; the parameters of the stage that takes the
-        slice; and the file that gives them, for errors.  Pixels are read last, by a thread for each core.
+        slice; and the file that gives them, for errors.
         """
         checks: dict[str, Check] = {}
         for request in requests:
             for name, check in self._checks(*request):
                 checks.setdefault(name, check)
-        faults = _faults(check for name, check in checks.items() if name not in self._done)
+        faults = []
+        for name, check in checks.items():
+            faults += _faults([check]) if name not in self._done else []
+            faults += self._pixel_faults() if len(self._pixels) == AT_ONCE else []
         self._done |= checks.keys()
+        return faults + self._pixel_faults()
+
+    def _pixel_faults(self) -> list[InputError]:
+        """Read the pixels of photos that were opened, each in a thread, and return their faults in order."""
         with ThreadPoolExecutor() as threads:
-            faults += chain.from_iterable(threads.map(lambda check: _faults([check]), self._pixels))
+            faults = list(chain.from_iterable(threads.map(lambda check: _faults([check]), self._pixels)))
         self._pixels.clear()
         return faults
 
@@ -71,10 +80,12 @@ class Validation:
         return _faults([*lights, *(partial(read_parts, p) for p in files.values() if p.suffix.lower() in MESHES)])
 
     def cautions(self) -> list[str]:
-        """Return a warning if the lights fall into groups without a shared material.
+        """Return warnings of materials that no mask shows, and of lights in groups without a shared material.
 
         Brightness and colour cannot be compared between such groups.
         """
+        unseen = [repr(name) for k, name in enumerate(self.spec.materials, 1) if self._seen and k not in self._seen]
+        cautions = [f"no mask shows {', '.join(unseen)}: remove it, or it is guessed"] if unseen else []
         by_light: dict[str, set[str]] = {}
         for photo in self.spec.photos:
             by_light.setdefault(photo.light, set()).update(
@@ -82,13 +93,14 @@ class Validation:
             )
         component = material_components({light: sorted(names) for light, names in by_light.items() if names})
         if (groups := len(set(component.values()))) < 2:
-            return []
+            return cautions
         lights = sorted(light for light, names in by_light.items() if names)
         members = [[light for light in lights if component[min(by_light[light])] == k] for k in range(groups)]
         return [
+            *cautions,
             f"the lights fall into {groups} groups that share no material ({'; '.join(map(', '.join, members))}): "
             "brightness and colour cannot be compared between them. "
-            "A photo that shows a material of each would link them"
+            "A photo that shows a material of each would link them",
         ]
 
     def _checks(
@@ -151,6 +163,7 @@ class Validation:
         check_values(path, most_megapixels, f"{key}.image")
         self._pixels.append(partial(opened.check_pixels, path, f"{key}.image"))
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
+        self._seen.update(np.flatnonzero(np.bincount(labels.label.ravel())).tolist())
         file = self.file(entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values())))
         if specks := describe_specks(labels.label > 0):
             log.warning("%s: %s.masks: %s", file, key, specks)

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
@@ -105,6 +106,10 @@ def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder)
     dataset = read_dataset(folder / "data" / "mine")  # a good data set as it stands
     assert dataset.photo("kitchen").masks == {"legs": "masks/kitchen/legs.png", "shell": "masks/kitchen_shell.png"}
     assert (folder / "data" / "mine" / "meshes" / "chair.mtl").is_file()
+    for more, cautions in ([], []), (["oak"], ["no mask shows 'oak': remove it, or it is guessed"]):
+        named = msgspec.structs.replace(dataset.spec, materials=[*dataset.spec.materials, *more])
+        validation = Validation(msgspec.structs.replace(dataset, spec=named))
+        assert validation.faults([("photo", None, {}, folder)]) == [] and validation.cautions() == cautions
 
 
 @pytest.mark.parametrize("photos, files, expected", [
