@@ -80,9 +80,10 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
     "did you mean 'photo.jpg'?"
     """
     known = sorted(str(k) for k in known)
+    given = unicodedata.normalize("NFC", word)
     word = word.strip("[]'\"")
     composed = unicodedata.normalize("NFC", word)
-    compared = [k for k in known[:MOST_COMPARED] if unicodedata.normalize("NFC", k) != composed]
+    compared = [k for k in known[:MOST_COMPARED] if unicodedata.normalize("NFC", k) != given]
     near = [k for k in compared if unicodedata.normalize("NFC", k).casefold() == composed.casefold()]
     near = near or get_close_matches(word, compared, 1, NEAR)
     near = near or get_close_matches(word, [k for k in compared if k[:1] == word[:1]], 1)
