@@ -30,7 +30,9 @@ plain sum its change would outweigh all others.
 
 Neighbouring residuals are correlated, so the standard error of d is taken over clusters.  Let A_k and B_k be the summed
 losses of cluster k of light i, and K the number of clusters.  By the delta method, log a_i − log b_i has the variance
-K/(K−1) Σ_k (A_k/ΣA − B_k/ΣB)².
+K/(K−1) Σ_k (A_k/ΣA − B_k/ΣB)².  Few clusters estimate it badly, so d in standard errors is distributed as Student's t,
+with K − 1 degrees of freedom, and over several lights with those of Welch and Satterthwaite.  The margin is the standard
+normal deviate of the same probability.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import softmax
+from scipy.special import ndtri, softmax, stdtr
 
 from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
@@ -120,6 +122,7 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
     if not counts.sum():
         return Decision(False)
     variances = []
+    freedom = []
     logs = []
     for a, b, cluster in zip(simpler.values, richer.values, richer.clusters, strict=True):
         # A_k and B_k, then log a_i − log b_i and its variance over clusters
@@ -129,11 +132,14 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
         number = len(sums_pair[0])
         spread = float(np.sum((shares[0] - shares[1]) ** 2))
         variances.append(number / (number - 1) * spread if number > 1 else ONE_CLUSTER)
+        freedom.append(max(number - 1.0, 1.0))
     share = counts / counts.sum()
-    # d of (1) and its standard error
+    # d of (1), its standard error and degrees of freedom, and the margin
     d = float(share @ [log_pair[0] - log_pair[1] for log_pair in logs])
-    error = float(np.sqrt(share**2 @ variances))
-    margin = d / max(error, 1e-12)
+    parts = share**2 * np.array(variances)
+    degrees = parts.sum() ** 2 / max(float(parts**2 @ (1 / np.array(freedom))), 1e-300)
+    t = d / max(float(np.sqrt(parts.sum())), 1e-12)
+    margin = float(np.copysign(ndtri(max(stdtr(max(degrees, 1.0), -abs(t)), 1e-300)), t))
     loss_with, loss_without = (float(np.exp(share @ [log_pair[k] for log_pair in logs])) for k in (1, 0))
     return Decision(margin > least, loss_with, loss_without, margin)
 

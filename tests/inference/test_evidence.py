@@ -20,12 +20,12 @@ from tests.inference.made import none_held_out
 from tests.inference.made_lights import photographed
 
 
-def made(seed: int, lights: int, gain: float = 0.0, rows: int = 60) -> tuple[Losses, Losses]:
+def made(seed: int, lights: int, gain: float = 0.0, rows: int = 60, clusters_of: int = 12) -> tuple[Losses, Losses]:
     """Squared residuals of two models, the richer better by a factor 1 + gain; a light each with its own scale."""
     rng, without, richer, clusters = np.random.default_rng(seed), [], [], []
     for _ in range(lights):
-        number = rng.integers(0, 12, rows)
-        shared, scale = rng.chisquare(3, 12)[number], rng.lognormal(0, 1)
+        number = rng.integers(0, clusters_of, rows)
+        shared, scale = rng.chisquare(3, clusters_of)[number], rng.lognormal(0, 1)
         both = [scale * (shared + rng.chisquare(2, rows)) / factor for factor in (1.0, 1 + gain)]
         without.append(both[0])
         richer.append(both[1])
@@ -73,13 +73,14 @@ def test_nothing_held_out_decides_nothing():
     assert compare_models(*both, CLEARLY_FOR).margin == pytest.approx(compare_models(one, better, CLEARLY_FOR).margin)
 
 
-def test_chance_is_rarely_evidence_though_residuals_are_alike():
+@pytest.mark.parametrize("lights, clusters", [(3, 12), (1, 3)])
+def test_chance_is_rarely_evidence_though_residuals_are_alike(lights, clusters):
     """Of one distribution more than two standard errors are found about one time in forty; each by its own, not by clusters, far more often."""
     kept, singly = [], []
-    for seed in range(200):
-        rng, (same, _) = np.random.default_rng(seed), made(seed, 3, rows=240)
+    for seed in range(400):
+        rng, (same, _) = np.random.default_rng(seed), made(seed, lights, rows=240, clusters_of=clusters)
         err = [
-            np.exp(0.3 * rng.normal(size=(2, 12))) for _ in same.values
+            np.exp(0.3 * rng.normal(size=(2, clusters))) for _ in same.values
         ]  # alike within a cluster, not between models
         both = [
             Losses([v * e[k][c] for v, e, c in zip(same.values, err, same.clusters, strict=True)], same.clusters)
