@@ -170,7 +170,7 @@ def _stored_rows(
             top = begin
             pixels = source.read_scanlines(spec.y + begin, spec.y + end, 0, first, last, spec.format)
         error = source.geterror()
-        if pixels is None or "Premature end" in error:
+        if pixels is None or "premature end" in error.lower():
             old_runs = "; if it has the run lengths of Radiance before 1991, convert it: ra_xyze -r in.hdr out.hdr"
             cure = COPY + old_runs * (source.format_name() == "hdr")
             raise InputError(f"truncated or damaged ({one_line(error)})", file=path, key=key, cure=cure)

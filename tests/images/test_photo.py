@@ -149,6 +149,9 @@ def test_other_kinds_of_files_are_refused_by_name(tmp_path):
     assert "ra_xyze -r a.hdr" in refusal("is a Radiance picture of XYZE", open_photo, path).cure
     path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 12 +X 18\n" + 12 * b"\x80\x80\x80\x80\1\1\1\x11")
     assert "ra_xyze" in refusal("truncated or damaged", read_photo, path).cure
+    jpeg = save(tmp_path / "a.jpg", np.random.default_rng(0).integers(0, 255, (96, 96, 3), np.uint8)).read_bytes()
+    path.write_bytes(jpeg[: len(jpeg) // 2] + b"\xff\xd9")  # a part is lost, though the file has an end
+    refusal("truncated or damaged", read_photo, path)
 
 
 XMP = (  # of a JPEG with a gain map, and of the map
