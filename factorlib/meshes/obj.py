@@ -63,8 +63,8 @@ class _Tables:
         """Check the numbers of vertices and triangles."""
         limits.check(len(self.coordinates["v"]) // 3, len(self.corners) - 2 * len(self.sizes), path)
 
-    def soup(self) -> TriangleSoup:
-        """Return the triangles of the whole file."""
+    def soup(self, name: str) -> TriangleSoup:
+        """Return the triangles of the whole file; `name` is that of a part without one."""
         normals = np.array(self.coordinates["vn"]).reshape(-1, 3)
         vertices = np.array(self.coordinates["v"], dtype=float).reshape(-1, 3)
         corners = np.array(self.corners, dtype=np.int64)
@@ -72,11 +72,13 @@ class _Tables:
         triangles = triangulate(vertices, sizes, corners)
         part = np.repeat(np.array(self.part, dtype=np.int64), sizes - 2)
         corner_normals = normals_at_corners(normals, np.array(self.corner_normals, dtype=np.int64)[triangles])
-        return TriangleSoup(vertices, corners[triangles], part, list(self.parts), corner_normals)
+        return TriangleSoup(
+            vertices, corners[triangles], part, [each or (name,) for each in self.parts], corner_normals
+        )
 
 
 def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
-    """Read the triangles of an OBJ file, with parts named by (usemtl, groups…, object).
+    """Read the triangles of an OBJ file, with parts named by (usemtl, groups…, object), else as the file.
 
     Args:
         path: File, to be named in errors.
@@ -105,7 +107,7 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
         if count % COUNTED_EVERY == 0:
             tables.check(limits, path)
     tables.check(limits, path)
-    return tables.soup()
+    return tables.soup(path.stem)
 
 
 def _index(word: str, count: int) -> int:

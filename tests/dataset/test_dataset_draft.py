@@ -73,7 +73,9 @@ def test_a_mask_without_labels_is_the_silhouette_of_one_material_and_that_is_sai
     (folder / "photos" / "kitchen.jpg").unlink(missing_ok=kind != "photo")
     if kind != "photo":
         Image.fromarray(pixels).convert("RGB").save(folder / "photos" / "kitchen.jpg")
+    (folder / "meshes" / "chair.obj").write_text(OBJ.replace("g ", "# "))  # without a name, as trimesh writes it
     missing, spec = made(folder, masks=None if kind == "photo" else "masks")
+    assert spec["meshes"] == {"chair": {"file": "meshes/chair.obj", "material": "label_1"}}
     assert spec["materials"] == ["label_1"] and all(
         "cut at half, it is the silhouette of label_1" in line for line in missing
     )

@@ -43,10 +43,17 @@ def area_of(mesh, label):
 
 
 @pytest.mark.parametrize(
-    "parts", [{"shell": "red", "legs": "oak"}, {"plastic": "red", "wood": "oak"}, {"shell": "red", "wood": "oak"}]
+    "parts",
+    [
+        {"shell": "red", "legs": "oak"},
+        {"plastic": "red", "wood": "oak"},
+        {"shell": "red", "wood": "oak"},
+        {"mesh": "red", "legs": "oak"},
+    ],
 )
-def test_obj_parts_go_by_group_or_usemtl_without_a_material_file(tmp_path, parts):
-    mesh = read_mesh(put(tmp_path / "mesh.obj", QUADS), MATERIALS, parts)
+def test_obj_parts_go_by_group_or_usemtl_or_else_by_the_file_without_a_material_file(tmp_path, parts):
+    content = QUADS.replace("g shell\nusemtl plastic", "") if "mesh" in parts else QUADS
+    mesh = read_mesh(put(tmp_path / "mesh.obj", content), MATERIALS, parts)
     assert len(mesh.faces) == 12  # quads and negative indices
     assert area_of(mesh, 1) == pytest.approx(3) and area_of(mesh, 2) == pytest.approx(3)
     assert not mesh.open
