@@ -184,8 +184,7 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
         reading("a picture", path, key, "save the mask again, as PNG; of a Cryptomatte the matte of each material"),
         Image.open(path, formats=FORMATS) as image,
     ):
-        size = size or image.size[::-1]
-        if sorted(image.size) != sorted(size):  # before anything is decoded
+        if size and sorted(image.size) != sorted(size):  # before anything is decoded
             check_size(image.size[::-1], size, path, key)
         if getattr(image, "n_frames", 1) > 1 or image.mode in ("I", "F"):
             raise InputError(
@@ -198,7 +197,7 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
         lossy = image.format == "JPEG" or image.info.get("compression") in ("jpeg", "tiff_jpeg", "webp")
         lossy |= image.format == "WEBP" and b"VP8L" not in Path(path).read_bytes()[: 1 << 16]
         ImageOps.exif_transpose(image, in_place=True)
-        check_size(image.size[::-1], size, path, key)
+        check_size(image.size[::-1], size or image.size[::-1], path, key)
         plain = image.mode in MODES and (image.mode != "P" or image.format == "PNG")  # others may reorder a palette
         decoded = image if plain else image.convert("RGBA" if image.has_transparency_data else "RGB")
         has_alpha = decoded.mode in ("P", "LA", "RGBA") and decoded.has_transparency_data
