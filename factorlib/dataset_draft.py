@@ -46,7 +46,7 @@ from factorlib.labels.mask_files import (
 )
 from factorlib.meshes.read_mesh import read_mesh, read_parts
 from factorlib.onboarding.matte import opaque_pixels
-from factorlib.onboarding.photo_folder import SUFFIXES, Cameras, read_photo_folder, stem_of_mask
+from factorlib.onboarding.photo_folder import SUFFIXES, UNREAD, Cameras, left_out, read_photo_folder, stem_of_mask
 from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
 
@@ -126,7 +126,10 @@ def new_dataset(
     if beside:
         masks = Path(os.path.commonpath([path.parent for path in mask_files]))
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes else []  # including .mtl and buffers
-    missing: list[str] = []
+    others = {*_files(photos, UNREAD, "PHOTOS", deep=True)} - {*mask_files, *photo_masks.values()}
+    names = left_out(photos, sorted(others), images.values())
+    some = ", ".join([*names[:5], *["…"] * (len(names) > 5)])
+    missing = [f"left out, for photos of this kind are not read: {some}; save them as PNG or JPEG"] if names else []
     paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
     labelled = _masks(masks, mask_files, paths, beside, missing) if masks else _cut_outs(paths, images, missing)
     entries = _meshes(meshes, mesh_files, labelled.materials) if meshes else {}

@@ -10,7 +10,7 @@ and copies at a smaller size (`images_2` beside `images`) are no photos.
 import os
 import re
 from collections import Counter
-from collections.abc import Container, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -31,6 +31,7 @@ AUXILIARY = re.compile(
 )  # names, no photos
 MASK_FOLDER = re.compile(r"(^|[_ -])(mask|msk|segmentation|silhouette)", re.IGNORECASE)
 DOWNSAMPLED = re.compile(r"^((?:image|mask)s?)_\d+$")  # folders of copies, as NeRF's programs write them
+UNREAD = (".webp", ".avif", ".bmp", ".gif", ".tga", ".jxl", ".jp2")  # pictures that are no photos
 SUFFIXES = (*PICTURES, ".json", ".bin", ".txt")  # suffixes of the files that are examined
 
 
@@ -88,6 +89,23 @@ def read_photo_folder(folder: Path, files: list[Path]) -> tuple[list[Path], dict
             cure="put it there, or delete the key",
         )
     return sorted(places[p] for p in images), {places[p]: places[mask] for p, mask in paired.items()}, cameras
+
+
+def left_out(folder: Path, files: Iterable[Path], photos: Collection[Path]) -> list[str]:
+    """Return the pictures among `files` that would be photos in another format, relative to the folder.
+
+    Where photos lie in the folder itself, its subfolders have none.
+    """
+    is_deep = all(path.parent != folder for path in photos)
+    places = [plain_path(path.relative_to(folder)) for path in files]
+    return [
+        str(place)
+        for place in places
+        if (is_deep or not place.parent.name)
+        and stem_of_mask(place) == place.stem
+        and not any(map(AUXILIARY.fullmatch, (*place.parent.parts, place.stem)))
+        and not any(MASK_FOLDER.search(name) or DOWNSAMPLED.match(name) for name in place.parent.parts)
+    ]
 
 
 def stem_of(path: PurePosixPath) -> str:

@@ -100,10 +100,21 @@ def test_masks_of_labelme_and_of_cvat_are_copied_and_name_the_materials(folder):
     assert "masks/labelmap.txt" in dataset_slice(read_dataset(folder / "data" / "mine"), "photo", "kitchen").files
 
 
-def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder):
+def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing_but_pictures_of_other_kinds(folder):
+    for name in [
+        "good.webp",
+        "kitchen_mask.webp",
+        "thumbnail.bmp",
+        "depth/7.webp",
+        "images_2/8.gif",
+        "masks/9.gif",
+        "b.AVIF",
+    ]:
+        put(folder / "photos" / name, "")
     masks(folder, kitchen_shell=SHELL, IMG_0412_shell=SHELL, kitchen__legs=LEGS, IMG_0412__legs=LEGS)
     missing, spec = made(folder)
-    assert missing == [] and spec["materials"] == ["legs", "shell"]
+    kinds = "left out, for photos of this kind are not read: b.AVIF, good.webp; save them as PNG or JPEG"
+    assert missing == [kinds] and spec["materials"] == ["legs", "shell"]
     assert spec["meshes"]["chair"]["parts"] == {"shell": "shell", "legs": "legs"}
     dataset = read_dataset(folder / "data" / "mine")  # a good data set as it stands
     assert dataset.photo("kitchen").masks == {"legs": "masks/kitchen/legs.png", "shell": "masks/kitchen_shell.png"}
