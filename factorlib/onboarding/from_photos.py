@@ -223,12 +223,13 @@ def cameras_of_folder(
 
 
 def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, SourceImage]:
-    """Return the image of each photo in a source of cameras, whose files are still where they lie."""
+    """Return the image of each posed photo in a source of cameras, whose files are still where they lie."""
     assert cameras.folder is not None  # a source of files
     kind, place = next(iter(cameras.source.items()))
     refuse = Refusal(cameras.folder, cameras.folder)
     images = READERS[kind](place.removeprefix("cameras/"), refuse)
-    return match_images({name: str(path) for name, path in paths.items()}, {}, kind, images, refuse)
+    matches = match_images({name: str(path) for name, path in paths.items()}, {}, kind, images, refuse)
+    return {name: image for name, image in matches.items() if image.posed}
 
 
 def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
                 photo.name,
                 photo.name,
             )
-        else:
+        elif image.posed:
             poses = _poses(photo, image, source, spec.meshes, refuse)
             intrinsics = photo.camera
             if intrinsics is not None and intrinsics.focal_px is not None and intrinsics.principal_point is not None:
@@ -83,7 +83,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
 def match_images(
     paths: Mapping[str, str], chosen: Mapping[str, str | int], kind: str, images: list[SourceImage], refuse: Refusal
 ) -> dict[str, SourceImage]:
-    """Return the image of the source for each photo that has one.
+    """Return the image of the source, with its pose or without, for each photo that has one.
 
     The match is by choice, else by path, by file name, or by file name without suffix; for BOP it is by id.
 
@@ -118,9 +118,9 @@ def match_images(
             result[photo] = candidates[0]
     examples = ", ".join(repr(image.name) for image in images[:3]) or "none at all"
     refuse.refuse_if(
-        not result,
+        not any(image.posed for image in result.values()),
         f"cameras.{kind}",
-        f"none of its {len(images)} images ({examples}) has the name of a photo",
+        f"none of its {len(images)} images ({examples}) with a pose has the name of a photo",
         "assign images to photos: cameras.images: {photo: image, …}",
     )
     return result

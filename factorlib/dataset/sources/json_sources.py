@@ -76,7 +76,7 @@ class TransformsFile(FrameCamera, frozen=True, kw_only=True):
 def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the frames of the dataset's file `path`, in its order; a frame's own lens overrides the file's.
 
-    A warning names frames without a pose, which are left out.
+    A warning names frames without a pose.
     """
     file = refuse.folder / path
     content = read_source(file, TransformsFile)
@@ -90,6 +90,7 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
         matrix_key = f"{key}.transform_matrix"
         if (rows := frame.transform_matrix) is None:
             log.warning("%s: %s: %s has no transform_matrix: its camera is not known", file, key, frame.file_path)
+            images.append(SourceImage(frame.file_path, camera, size, key, posed=False))
             continue
         refuse.refuse_if(
             len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)),
@@ -109,7 +110,12 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
             cam_from_world=rigid_motion((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse(),
         )
         images.append(image)
-    refuse.refuse_if(not images, "frames", "none has a transform_matrix", "register the photos, or remove this file")
+    refuse.refuse_if(
+        not any(image.posed for image in images),
+        "frames",
+        "none has a transform_matrix",
+        "register the photos, or remove this file",
+    )
     return images
 
 

@@ -31,7 +31,8 @@ class SourceImage(msgspec.Struct, frozen=True):
         key: place in the source, for messages
         centred: True if the source does not give the principal point
         focal_known: False if the source does not give the focal length
-        cam_from_world: None if the source has no world
+        cam_from_world: None if the source has no world, or not this image's pose
+        posed: False if the source does not give the pose
         poses: cam_from_object of each instance by obj_id, in millimetres
     """
 
@@ -43,6 +44,7 @@ class SourceImage(msgspec.Struct, frozen=True):
     focal_known: bool = True
     cam_from_world: pycolmap.Rigid3d | None = None
     poses: dict[int, list[RigidTransform]] = {}
+    posed: bool = True
 
 
 def read_source(file: Path, type_: type, key: str | None = None) -> Any:
