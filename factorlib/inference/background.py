@@ -29,11 +29,10 @@ from factorlib.light.lobes import lobe_energy
 
 DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is observed whole
 # Standard deviations of the factor that all cells of a light share: of the mean over channels of its logarithm, and of
-# tints about it.  Two sets of six photos with backgrounds were relit by factors of 1.15, 1.11, 1.04 and 1.21, 1.16,
-# 1.06 (RGB), and a factor of a set is the mean of its photos'.  So the deviations are √6 times those of the two sets,
-# 0.115 for the mean and 0.06 for tints.
-SCALE_DEVIATION = 0.28
-TINT_DEVIATION = 0.15
+# tints about it.  Two sets with backgrounds were relit by factors of 1.15, 1.11, 1.04 and 1.21, 1.16, 1.06 (RGB): in
+# both sets in the same direction, so that the photos of a set have it in common, and a light has that of its set.
+SCALE_DEVIATION = 0.115
+TINT_DEVIATION = 0.06
 SHARED_COVARIANCE = np.full((3, 3), SCALE_DEVIATION**2) + TINT_DEVIATION**2 * (np.eye(3) - 1 / 3)  # T
 SHARPEST = 350.0  # largest λ of a kernel, about as wide as a texel
 # Least share of the sphere that the background of a photo covers.  A long lens shows only what is straight behind the
