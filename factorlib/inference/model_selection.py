@@ -31,8 +31,8 @@ plain sum its change would outweigh all others.
 Neighbouring residuals are correlated, so the standard error of d is taken over clusters.  Let A_k and B_k be the summed
 losses of cluster k of light i, and K the number of clusters.  By the delta method, log a_i − log b_i has the variance
 K/(K−1) Σ_k (A_k/ΣA − B_k/ΣB)².  Few clusters estimate it badly, so d in standard errors is distributed as Student's t,
-with K − 1 degrees of freedom, and over several lights with those of Welch and Satterthwaite.  The margin is the standard
-normal deviate of the same probability.
+with K − 1 degrees of freedom, and over several lights with those of Welch and Satterthwaite.  The margin is the
+standard normal deviate of the same probability.
 """
 
 from __future__ import annotations
