@@ -145,7 +145,8 @@ def colour_space(
         exif = load_tags(path)
         with suppress(*DAMAGED), warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             info = image.info
-            exif = exif or image.getexif()
+            if not exif and image.format != "PNG":  # which would be decoded whole
+                exif = image.getexif()
         if "gamma" in info or "chromaticity" in info:
             return default if "srgb" in info else _png_space(info)
         if {Base.TransferFunction, Base.PrimaryChromaticities}.intersection(exif):
