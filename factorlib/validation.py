@@ -1,8 +1,8 @@
 """Validation of files before anything runs: photos against masks, meshes against parts, and files of recipes.
 
 The checks are those that stages make first, by the same functions, and the consistency of materials in masks and
-dataset.yaml.  Of a photo, the header and the first and last row are read.  The runner loads this module by name, as it
-loads stages.  It knows no science, and a run with nothing to do must not import any.
+dataset.yaml.  Of a photo, header and pixels are checked (`OpenPhoto.check_pixels`).  The runner loads this
+module by name, as it loads stages.  It knows no science, and a run with nothing to do must not import any.
 """
 
 import logging

@@ -73,7 +73,7 @@ class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
         return (self.width, self.height) if self.orientation >= 5 else (self.height, self.width)
 
     def check_pixels(self, path: str | Path, key: str | None = None) -> None:
-        """Read the first and the last row, or unpack a raw photo.
+        """Read the first and the last row; check the chunks of a PNG, and unpack a raw photo.
 
         Args:
             path: File to name in the error.
