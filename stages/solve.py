@@ -238,7 +238,7 @@ def _run_solver(
         else _surface_start(inputs, problem) or start_from_photos(len(names))
     )
     choices = with_earlier_decisions(params, earlier) if earlier else params
-    return solve(problem, start, choices, FitRunner(unfinished, solve_progress(progress, choices)))
+    return solve(problem, start, choices, FitRunner(unfinished, solve_progress(progress)))
 
 
 def _held_out_photos(

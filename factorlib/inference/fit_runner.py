@@ -18,24 +18,20 @@ import torch
 from factorlib.checkpoint import Checkpoint
 from factorlib.inference.fit import Fit, FitSchedule, fit_problem
 from factorlib.inference.materials import MaterialErrors, Point
-from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.results.materials import Decision
 
 
 class Event(msgspec.Struct, frozen=True):
-    """Evaluation of one point, or the end of a phase.
-
-    `FitRunner.fit_and_report` ends with an event of iteration −1, which states the held-out loss.  It is NaN in all
-    others.
+    """Evaluation of one point.
 
     Attributes:
         round: Number of the fit.
         phase: Name of the phase.
         iteration: Number of the evaluation in this fit.
         loss: Whitened loss per fitted channel value; 1 means explained to the noise model.
-        held_out: Held-out loss.
+        held_out: Held-out loss, of the paper's solver alone; NaN otherwise.
         lobes: Number of lobes or cells.
     """
 
@@ -57,10 +53,13 @@ PHASES = {
     "background": (9, 1),
     "tone curves": (9, 1),
     "distances": (25, 1.5),
+    "splitting": (12, 3),
     "materials and lights": (10, 7),
+    "more observations": (1, 1),
+    "prior": (1, 3),
+    "lights": (5, 14),
+    "suns": (12, 10),
 }
-SPLITTING = (7, 9)
-LAST = {"prior": (1, 3), "lights": (5, 14), "suns": (12, 10)}
 
 
 # Factor on the number of observations where materials are given: +0.25 dB on data/eames, +0.27 on the made set of 101.
@@ -144,14 +143,13 @@ def subset_progress(progress: Progress, subsets: int) -> EventReport:
     return report
 
 
-def solve_progress(progress: Progress, options: SolveOptions) -> EventReport:
+def solve_progress(progress: Progress) -> EventReport:
     """Return a report that converts events of the joint solve to progress, in evaluations of the first phase.
 
     Progress moves with every evaluation.  It never goes back, even if several starts enter a phase several times.
     """
-    phases = PHASES | {f"splitting {k + 1}": SPLITTING for k in range(options.splittings)} | LAST
-    costs = {phase: points * cost for phase, (points, cost) in phases.items()}
-    evaluations = dict.fromkeys(phases, 0)
+    costs = {phase: points * cost for phase, (points, cost) in PHASES.items()}
+    evaluations = dict.fromkeys(PHASES, 0)
     total = sum(costs.values())
     furthest = 0.0
 
@@ -162,8 +160,8 @@ def solve_progress(progress: Progress, options: SolveOptions) -> EventReport:
         """
         nonlocal furthest
         evaluations[event.phase] += 1
-        within = 1.0 if event.iteration < 0 else 1 - 0.25 ** (evaluations[event.phase] / phases[event.phase][0])
-        cost_before = sum(costs[phase] for phase in list(phases)[: list(phases).index(event.phase)])
+        within = 1 - 0.25 ** (evaluations[event.phase] / PHASES[event.phase][0])
+        cost_before = sum(costs[phase] for phase in list(PHASES)[: list(PHASES).index(event.phase)])
         furthest = max(furthest, min(cost_before + within * costs[event.phase], 0.999 * total))
         progress(furthest, total, event.phase)
 
@@ -252,20 +250,6 @@ class FitRunner:
             iteration += 1
 
         return fit_problem(problem, start, self.prior, schedule, tell)
-
-    def fit_and_report(self, phase: str, problem: JointProblem, start: Fit, schedule: FitSchedule) -> Fit:
-        """Fit, and report the held-out loss as the end of the phase (iteration −1).
-
-        Args:
-            phase: Name of the phase.
-            problem: Observations and model.
-            start: Initial fit.
-            schedule: Number of steps.
-        """
-        fit = self.fit(phase, problem, start, schedule)
-        held_out = problem.held_out_loss(fit.point)
-        self._record(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
-        return fit
 
     def enter(self, phase: str) -> None:
         """Report the start of a phase that fits nothing, as an event with the loss of the one before."""

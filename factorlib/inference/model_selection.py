@@ -1,20 +1,26 @@
 """Model choices that a scene needs, made in the model that gives the answer.
 
 effects     No shadows, shadows of the given meshes, or shadows with interreflection, on fewer observations and cells.
-            Shadows are fitted from every first guess.  Models with and without them continue from the best result, and
-            interreflection is compared from one start as well.  Shadows stay unless held-out
-            observations are against them.  Interreflection needs shadows, and a marginal likelihood that supports it.
+            Shadows are fitted from every first guess, and the model without them goes one step from the best result.
+            Unless held-out observations clearly support shadows against that, both models continue from there.  Shadows
+            stay unless held-out observations are against them.  Interreflection needs shadows, and a marginal
+            likelihood that supports it.
 background  The surroundings that photos show are observations of a light unless the objects are strongly against it.
-tone        Exponents of tone curves are freed for all photos.  A light keeps its curves under three conditions: the
-            evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher, and they end within the
-            range of real cameras.  An exponent also fits some errors of the rest of the model, such as wrong normals.
-distance    The marginal likelihoods of a light at infinity and at `CURVATURES` decide.  They use all fitted
+tone        Exponents of tone curves are freed for all photos, at first for one step.  A light keeps its curves under
+            three conditions: the evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher,
+            and they end within the range of real cameras.  An exponent also fits some errors of the rest of the model,
+            such as wrong normals.
+distance    The marginal likelihoods of a light at infinity and at a finite distance decide.  They use all fitted
             observations; the few that are held out decide differently from draw to draw.
 ground      The shadows on the ground are observations of a light if they lie where the light that the objects tell of
             casts them.  A cut-out or a picture of a floor has none, and a wrong plane has others.
 roughness   With few materials, the start decides which local minimum a fit reaches: a smooth surface in soft light
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
+
+Most effects are not there.  Interreflection and distances are therefore fitted only if a score test predicts a log
+Bayes factor of `PLAUSIBLE` (`factorlib.inference.score_test`), tone curves only if one step gains half of what they
+need.
 
 Models that are compared are fitted from one start with the same number of steps: one that got more descent would seem
 better.  Shadows and tone curves compare two models that are fitted to the same observations with reliable normals, by
@@ -37,20 +43,21 @@ standard normal deviate of the same probability.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import ndtri, softmax, stdtr
+from scipy.special import ndtri, stdtr
 
 from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
-from factorlib.inference.fit_runner import SolveState
+from factorlib.inference.fit_runner import FitRunner, SolveState
+from factorlib.inference.forward import Illumination
 from factorlib.inference.materials import Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
+from factorlib.inference.score_test import ScoreTest
 from factorlib.results.materials import Decision
 
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
@@ -68,14 +75,17 @@ CONTINUED_TRIAL = FitSchedule(light_steps=2, descents=(4, 2), estimate_first=Fal
 BACKGROUND_SCHEDULE = FitSchedule(light_steps=2, descents=(6,))
 BOUNCE_SCHEDULE = FitSchedule(light_steps=2, descents=(6,), estimate_first=False)
 AFTER_BOUNCES = FitSchedule(descents=(2,))
+ONE_STEP = FitSchedule(descents=(1,), estimate_first=False)
 TONE_SCHEDULE = FitSchedule(descents=(8,), estimate_first=False)
 # Least relative gain of the held-out loss.  Under two standard errors alone, a photo with a wrong pose got a curve
 # (margin 3.0, captured set of seed 7), and k_d was 30 % wrong instead of 13 %.
 LEAST_TONE_GAIN = 0.25
 VERY_STRONG = 5.0  # log Bayes factor of very strong evidence (Kass and Raftery 1995)
-# Curvatures of lights 20, 10 and 5 RMS distances away.  A chair's points are 0.4 m from their centre, and a room's
-# walls and lamps 2 to 8 m.
-CURVATURES = (0.05, 0.1, 0.2)
+PLAUSIBLE = VERY_STRONG / 2  # predicted log Bayes factor below which an effect is not fitted
+# Curvatures of lights 20 and 5 RMS distances away, the step of the score test and the largest.  A chair's points are
+# 0.4 m from their centre, and a room's walls and lamps 2 to 8 m.
+CURVATURE_STEP = 0.05
+LARGEST_CURVATURE = 0.2
 DISTANCE_SCHEDULE = FitSchedule(light_steps=2, descents=(2,), estimate_first=False)
 LIGHTS_ONLY = FitSchedule(light_steps=3, materials_fixed=True)
 TEMPERED_LIGHTS = FitSchedule(descents=(0, 3), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
@@ -83,8 +93,6 @@ TEMPERED_LIGHTS = FitSchedule(descents=(0, 3), temperature_factor=LIGHT_TEMPERAT
 # say little of most directions that a background shows, and the errors of the model count against it.
 BACKGROUND_DOUBT = 15.0
 LEAST_CORRELATION = 0.3  # of shadows on the ground, predicted and observed
-
-Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem, start and schedule
 
 
 class Losses(NamedTuple):
@@ -168,14 +176,14 @@ def comparison_sample(problem: JointProblem, options: SolveOptions) -> JointProb
     return problem.subsample(min(TRIAL_OBSERVATIONS, options.observations), options.seed)
 
 
-def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptions, run_fit: Fitting) -> SolveState:
+def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptions, run: FitRunner) -> SolveState:
     """Choose shadows by held-out observations, and interreflection by marginal likelihood.
 
     Args:
         problem: Observations with reliable normals.
         starts: First guesses, of which the best result continues, or one fit.
         options: Options of the user.
-        run_fit: Function that fits a model.
+        run: Runner of the fits.
     """
     sample = comparison_sample(problem, options).keep_backgrounds([]).keep_grounds([])
     hidden = any(block.visibility is not None for block in problem.blocks)
@@ -185,7 +193,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     def fit_best(name: str, with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
         """Return the best fit of one model from the starts, and its losses."""
         model = sample.with_effects(with_shadows, with_bounces)
-        fits = [run_fit(name, model, fit, CONTINUED_TRIAL if fit.fitted else TRIAL) for fit in starts]
+        fits = [run.fit(name, model, fit, CONTINUED_TRIAL if fit.fitted else TRIAL) for fit in starts]
         results = [(fit, held_out_losses(model, fit.point)) for fit in fits]
         return min(results, key=lambda result: _log_geometric_mean(result[1]))
 
@@ -194,23 +202,26 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
         return SolveState(fit, fit)
     forced = bounces == "on"
     with_shadows = "shadows and bounces" if forced else "shadows", True, forced
-    compared = shadows == "auto" and not problem.none_held_out
-    if compared and not starts[0].fitted:  # both models continue from one fit
-        starts = [fit_best(*with_shadows)[0]]
     fit, losses = fit_best(*with_shadows)
     decision = Decision(True)
-    if compared:
-        plain, plain_losses = fit_best("no shadows", False, False)
-        decision = compare_models(plain_losses, losses, CLEARLY_AGAINST)
-        if not decision.accepted:
-            return SolveState(plain, plain, decision)
+    if shadows == "auto" and not problem.none_held_out:
+        bare = run.fit("no shadows", sample.with_effects(False, False), fit, ONE_STEP)
+        bare_losses = held_out_losses(sample.with_effects(False, False), bare.point)
+        decision = compare_models(bare_losses, losses, CLEARLY_AGAINST)
+        if (decision.margin or 0.0) < CLEARLY_FOR:  # both continue from one fit
+            starts = [fit]
+            fit, losses = fit_best(*with_shadows)
+            bare, bare_losses = fit_best("no shadows", False, False)
+            decision = compare_models(bare_losses, losses, CLEARLY_AGAINST)
+            if not decision.accepted:
+                return SolveState(bare, bare, decision)
     if bounces == "auto":
-        selection = select_interreflection(sample, fit, run_fit)
+        selection = select_interreflection(sample, fit, run)
         return SolveState(selection.fit, selection.fit, decision, selection.evidence[0])
     return SolveState(fit, fit, decision, Decision(forced))
 
 
-def select_interreflection(sample: JointProblem, start: Fit, run_fit: Fitting) -> Selection:
+def select_interreflection(sample: JointProblem, start: Fit, run: FitRunner) -> Selection:
     """Choose interreflection by the marginal likelihoods of two fits, with and without it, from one start.
 
     Both have the hyperparameters of the start.
@@ -218,15 +229,26 @@ def select_interreflection(sample: JointProblem, start: Fit, run_fit: Fitting) -
     Args:
         sample: Observations on which models are compared.
         start: Fit with shadows alone.
-        run_fit: Function that fits a model.
+        run: Runner of the fits.
     """
     models = [sample.with_effects(True, with_bounces) for with_bounces in (False, True)]
     phase = "shadows and bounces"
-    fits = [run_fit(phase, model, start, BOUNCE_SCHEDULE) for model in models]
+    bounced = {block.name: block.bounced for block in models[1].without_held_out().blocks}
+
+    def send(illumination: Illumination, share: float) -> Illumination:
+        """Return the illumination with a share of the radiance that surfaces send."""
+        radiance = bounced[illumination.block.name]
+        sent = None if radiance is None else share * radiance
+        return msgspec.structs.replace(illumination, block=msgspec.structs.replace(illumination.block, bounced=sent))
+
+    predicted = ScoreTest(models[0], start, run.prior).of_all_lights(send, 0.5, 1.0).log_bayes_factor
+    if predicted < PLAUSIBLE:
+        return Selection(start, [Decision(False, log_bayes_factor=predicted)])
+    fits = [run.fit(phase, model, start, BOUNCE_SCHEDULE) for model in models]
     log_bayes_factor = (fits[0].value - fits[1].value) / 2
     decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
     index = int(decision.accepted)
-    return Selection(run_fit(phase, models[index], fits[index], AFTER_BOUNCES), [decision])
+    return Selection(run.fit(phase, models[index], fits[index], AFTER_BOUNCES), [decision])
 
 
 def _log_geometric_mean(losses: Losses) -> float:
@@ -239,7 +261,7 @@ def _log_geometric_mean(losses: Losses) -> float:
     return round(float(np.dot(counts, logs)) / max(sum(counts), 1), 6)
 
 
-def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
+def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions, run: FitRunner) -> Selection:
     """Choose by marginal likelihood the lights that are also observed by the surroundings that photos show.
 
     Materials and all lights are fitted with all backgrounds.  Given these materials, each light is fitted with its
@@ -250,7 +272,7 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
         problem: Observations with reliable normals, with the backgrounds of all lights.
         before: Fit to the comparison sample.
         options: Options of the user.
-        run_fit: Function that fits a model.
+        run: Runner of the fits.
     """
     pairs = zip(problem.blocks, before.point.lights, strict=True)
     candidates = [block.background is not None and not light.fixed.any() for block, light in pairs]
@@ -263,9 +285,9 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
     fit = before
     while accepted.any():
         model = sample.keep_backgrounds(accepted.tolist())
-        fit = run_fit("background", model, fit, BACKGROUND_SCHEDULE)
-        start = run_fit("background", without, fit, TEMPERED_LIGHTS)
-        values = [run_fit("background", each, start, LIGHTS_ONLY).light_values for each in (without, model)]
+        fit = run.fit("background", model, fit, BACKGROUND_SCHEDULE)
+        start = run.fit("background", without, fit, TEMPERED_LIGHTS)
+        values = [run.fit("background", each, start, LIGHTS_ONLY).light_values for each in (without, model)]
         factors = np.where(accepted, (np.array(values[0]) - values[1]) / 2, factors)
         # the worst first: they shift the scale of all
         doubtful = accepted & (factors < min(-BACKGROUND_DOUBT, factors[accepted].min() / 2))
@@ -299,14 +321,14 @@ def select_grounds(problem: JointProblem, fit: Fit, options: SolveOptions) -> li
     return decisions
 
 
-def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
+def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions, run: FitRunner) -> Selection:
     """Choose by held-out observations which lights get tone curves, and fit them.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
         start: Fit to the comparison sample.
         options: Options of the user.
-        run_fit: Function that fits a model.
+        run: Runner of the fits.
     """
     curved_before = [len(light.log_tone) > 0 for light in start.point.lights]
     if options.tone == "off" or problem.none_held_out:
@@ -316,37 +338,45 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
         light if has else msgspec.structs.replace(light, log_tone=np.zeros_like(light.log_exposure))
         for light, has in zip(start.point.lights, curved_before, strict=True)
     ]
-    plain, curved = (
-        run_fit("tone curves", sample, start.with_lights(lights), TONE_SCHEDULE)
-        for lights in (start.point.lights, freed)
-    )
-    losses_without, losses_with = (held_out_losses(sample, fit.point) for fit in (plain, curved))
+
+    def compare(schedule: FitSchedule) -> tuple[Fit, Fit, list[Decision]]:
+        """Return the fits without curves and with them, and a comparison of each light."""
+        plain, curved = (
+            run.fit("tone curves", sample, start.with_lights(lights), schedule)
+            for lights in (start.point.lights, freed)
+        )
+        losses = [held_out_losses(sample, fit.point) for fit in (plain, curved)]
+        pairs = ([each.one_light(k) for each in losses] for k in range(len(freed)))
+        return plain, curved, [compare_models(*pair, CLEARLY_FOR) for pair in pairs]
+
+    plain, curved, compared = compare(ONE_STEP)
+    if any(gains(decision, LEAST_TONE_GAIN / 2) for decision in compared):
+        plain, curved, compared = compare(TONE_SCHEDULE)
     evidence = []
-    for k, light in enumerate(curved.point.lights):
-        decision = compare_models(losses_without.one_light(k), losses_with.one_light(k), CLEARLY_FOR)
+    for has, decision, light in zip(curved_before, compared, curved.point.lights, strict=True):
         accepted = decision.accepted and gains(decision, LEAST_TONE_GAIN) and not light.implausible_tone
-        evidence.append(Decision(True) if curved_before[k] else msgspec.structs.replace(decision, accepted=accepted))
+        evidence.append(Decision(True) if has else msgspec.structs.replace(decision, accepted=accepted))
     if all(decision.accepted for decision in evidence):
         return Selection(curved, evidence)
     if not any(decision.accepted and not has for decision, has in zip(evidence, curved_before, strict=True)):
         return Selection(plain, evidence)
     pairs = zip(curved.point.lights, plain.point.lights, strict=True)
     mixed = [pair[0 if decision.accepted else 1] for pair, decision in zip(pairs, evidence, strict=True)]
-    return Selection(run_fit("tone curves", sample, plain.with_lights(mixed), TONE_SCHEDULE), evidence)
+    return Selection(run.fit("tone curves", sample, plain.with_lights(mixed), TONE_SCHEDULE), evidence)
 
 
-def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
+def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, run: FitRunner) -> Selection:
     """Choose distances of lights by their marginal likelihoods.
 
-    Materials adapt to the distances at which they are fitted.  Each light is therefore compared twice: with materials
-    and lights fitted at infinity and at each of `CURVATURES`, and, if that favours a near light, with the materials of
-    the near lights.  The smaller Bayes factor counts.
+    A score test predicts the curvature of each light.  Materials adapt to the distances at which they are fitted.
+    Each light that may be near is therefore compared twice: with materials and lights fitted at infinity and at the
+    predicted curvatures, and with the materials of the near lights.  The smaller Bayes factor counts.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
         before: Fit to the comparison sample.
         options: Options of the user.
-        run_fit: Function that fits a model.
+        run: Runner of the fits.
     """
     pairs = enumerate(zip(before.point.lights, problem.blocks, strict=True))
     candidates = [k for k, (light, block) in pairs if not (light.curvature or light.fixed.any() or block.place is None)]
@@ -355,29 +385,35 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         return Selection(before, evidence)
     sample = comparison_sample(problem, options)
 
+    def approach(illumination: Illumination, curvature: float) -> Illumination:
+        """Return the illumination with its light at a finite distance."""
+        light = msgspec.structs.replace(illumination.light, curvature=curvature)
+        return msgspec.structs.replace(illumination, light=light, table=None)
+
+    predicted = ScoreTest(sample, before, run.prior).of_each_light(approach, CURVATURE_STEP, LARGEST_CURVATURE)
+    for k in candidates:
+        evidence[k] = Decision(False, log_bayes_factor=predicted[k].log_bayes_factor)
+    near = {k: predicted[k].size for k in candidates if predicted[k].log_bayes_factor > PLAUSIBLE}
+    if not near:
+        return Selection(before, evidence)
+
     def fit_with_curvatures(
         curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE
     ) -> Fit:
         """Return the fit with lights of these curvatures, by number of the light."""
         pairs = enumerate(start.point.lights)
         lights = [msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature)) for k, light in pairs]
-        return run_fit("distances", sample, start.with_lights(lights), schedule)
+        return run.fit("distances", sample, start.with_lights(lights), schedule)
 
-    values = np.array([fit_with_curvatures(dict.fromkeys(candidates, c)).light_values for c in (0.0, *CURVATURES)])
-    log_bayes_factors = (values[0] - values[1:]) / 2
-    likely = softmax(log_bayes_factors, axis=0).T @ CURVATURES
-    factor = log_bayes_factors.max(0)
-    near = {k: float(likely[k]) for k in candidates if factor[k] > VERY_STRONG}
-    if near:
-        near_fit = fit_with_curvatures(near)
-        alternatives = (dict.fromkeys(near, 0.0), near)
-        far_values, near_values = (fit_with_curvatures(c, near_fit, LIGHTS_ONLY).light_values for c in alternatives)
-        given_materials = (np.array(far_values) - near_values) / 2
-        factor[list(near)] = np.minimum(factor, given_materials)[list(near)]
-    for k in candidates:
+    far = dict.fromkeys(near, 0.0)
+    far_fit, near_fit = (fit_with_curvatures(curvatures) for curvatures in (far, near))
+    given_materials = [fit_with_curvatures(curvatures, near_fit, LIGHTS_ONLY) for curvatures in (far, near)]
+    pairs = (far_fit, near_fit), given_materials
+    factor = np.min([(np.array(a.light_values) - b.light_values) / 2 for a, b in pairs], axis=0)
+    for k in near:
         evidence[k] = Decision(bool(factor[k] > VERY_STRONG), log_bayes_factor=float(factor[k]))
     curvatures = {k: c * near_share(factor[k]) for k, c in near.items() if evidence[k].accepted}
-    return Selection(fit_with_curvatures(curvatures) if curvatures else before, evidence)
+    return Selection(fit_with_curvatures(far | curvatures, near_fit) if curvatures else far_fit, evidence)
 
 
 def near_share(log_bayes_factor: float) -> float:

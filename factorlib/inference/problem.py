@@ -55,6 +55,16 @@ class JointProblem(msgspec.Struct, frozen=True):
             for b, light in zip(self.blocks, point.lights, strict=True)
         ]
 
+    def tabulated(self, point: Point) -> list[Illumination]:
+        """Return each block with its light and the table of responses at the roughness of the materials."""
+        fixed = point.materials.roughness
+        return [
+            msgspec.structs.replace(
+                each, table=self.tables.get(each.block, each.light.unit_lobes, self.operator, fixed)
+            )
+            for each in self.illuminations(point)
+        ]
+
     def radiance(self, point: Point) -> list[Float[np.ndarray, "n 3"]]:
         """Return the predicted radiance of every observation, block by block, in the block's unit."""
         return [illumination.radiance() for illumination in self.illuminations(point)]

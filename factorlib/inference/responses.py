@@ -16,6 +16,7 @@ sharper than `COARSE_SHARPNESS` blur highlights, and every second node is enough
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import lru_cache
 from hashlib import blake2b
 from math import prod
 from threading import Lock
@@ -228,7 +229,7 @@ class ResponseTable:
         # cubic interpolation between the four nearest nodes, in log roughness
         start = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
         nodes = self.nodes[start : start + DEGREE + 1]
-        share, slope = lagrange_weights(np.log(nodes), float(np.log(roughness)))
+        share, slope = lagrange_weights(tuple(np.log(nodes).tolist()), float(np.log(roughness)))
         if self._stacks.get(m, (None,))[0] != start:
             known = [self._specular_at_node(m, start + k) for k in range(DEGREE + 1)]
             self._stacks[m] = start, np.stack([self._diffuse_of(m), *known])
@@ -302,19 +303,17 @@ class ResponseCache:
         return table
 
 
-def lagrange_weights(
-    nodes: Float[np.ndarray, " k"], x: float
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+@lru_cache(maxsize=256)  # all lights ask for the same materials
+def lagrange_weights(nodes: tuple[float, ...], x: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return the weights of values at `nodes` in the interpolating polynomial at x, and in its derivative.
 
-    >>> [w.tolist() for w in lagrange_weights(np.array([0.0, 1.0, 2.0]), 0.25)]
+    >>> [w.tolist() for w in lagrange_weights((0.0, 1.0, 2.0), 0.25)]
     [[0.65625, 0.4375, -0.09375], [-1.25, 1.5, -0.25]]
     """
     value = []
     slope = []
-    points = nodes.tolist()
-    for a, node in enumerate(points):
-        other_nodes = points[:a] + points[a + 1 :]
+    for a, node in enumerate(nodes):
+        other_nodes = nodes[:a] + nodes[a + 1 :]
         below = prod(node - node_b for node_b in other_nodes)
         value.append(prod(x - node_b for node_b in other_nodes) / below)
         slope.append(

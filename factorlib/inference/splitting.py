@@ -6,72 +6,58 @@ likelihood of a light, (1) of `factorlib.inference.likelihood`.  The log Bayes f
 
     log B_i = (F_i(cells) − F_i(smaller cells))/2                                                                  (1)
 
-The cells of a light split if log B_i exceeds `VERY_STRONG`; then materials and lights are fitted anew.  This uses all
-fitted observations.  The few that are held out decide differently from draw to draw: on three exact spheres they refuse
-the first splitting (margin −0.24), which (1) supports by 1,200.
+The cells of a light split if log B_i exceeds `VERY_STRONG`, and the smaller ones may split again.  Materials and lights
+are fitted together after that.  (1) uses all fitted observations.  The few that are held out decide differently from
+draw to draw: on three exact spheres they refuse the first splitting (margin −0.24), which (1) supports by 1,200.
 """
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 
-from factorlib.inference.fit import FitSchedule
-from factorlib.inference.fit_runner import FitRunner, SolveState
+from factorlib.inference.fit import Fit
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.lights import Light
+from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import LIGHTS_ONLY, VERY_STRONG
-from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
-AFTER_SPLITTING = FitSchedule(light_steps=2, descents=(3, 2), estimate_first=False)
 SPLIT_CELLS = 24  # number of a light's cells that split at once
 # Least distance between cells, degrees: the sun's width.  A cell splits only if its neighbours are twice as far.
 LEAST_SPACING_DEG = 0.5
-# Where the model explains the fitted observations closely, errors of few observations matter: k_d of data/synthetic is
-# 13 % wrong with 1,000, 2.6 % with 4,000 and 1.0 % with 8,000.
-OBSERVATION_FACTOR = 8  # factor on the number of observations there
-# Mean robust loss of a fitted value below which it does, after the first splitting: 0.1 to 0.2 on exact sets, at least
-# 0.5 on 17 sets of rendered photographs with wrong normals.
-SMALL_LOSS = 0.3
 
 
-def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions, run: FitRunner) -> SolveState:
-    """Split the cells with most energy, at most `SolveOptions.splittings` times, while (1) of any light supports it.
-
-    If the loss after the first splitting is below `SMALL_LOSS`, all later fits use `OBSERVATION_FACTOR` times as many
-    observations.
+def split_cells(phase: str, problem: JointProblem, fit: Fit, limit: int, run: FitRunner) -> tuple[Fit, list[Decision]]:
+    """Split the cells with most energy while (1) supports it; return the fit, materials unchanged, and the decisions.
 
     Args:
-        problem: Observations with reliable normals, under the chosen effects.
-        state: State with a fit of materials and lights.
-        options: Options of the user.
+        phase: Name of the phase.
+        problem: Observations that are fitted, under the chosen effects.
+        fit: Fit of the lights.
+        limit: Largest number of splittings.
         run: Runner of the fits.
     """
-    fit = state.fit
-    observations = state.observations
-    sample = problem.subsample(observations, options.seed)
+    lights = list(fit.point.lights)
+    candidates = list(range(len(lights)))
     evidence: list[Decision] = []
-    for number in range(options.splittings):
-        phase = f"splitting {number + 1}"
-        finer = [split_brightest(light) for light in fit.point.lights]
-        trials = [run.fit(phase, sample, fit.with_lights(lights), LIGHTS_ONLY) for lights in (fit.point.lights, finer)]
+    for _ in range(limit):
+        chosen = problem.select_lights(candidates)
+        point = Point(fit.point.materials, [lights[k] for k in candidates])
+        coarse = Fit(point, [fit.hyperparameters[k] for k in candidates])
+        finer = coarse.with_lights([split_brightest(light) for light in coarse.point.lights])
+        trials = [run.fit(phase, chosen, start, LIGHTS_ONLY) for start in (coarse, finer)]
         coarse_values, fine_values = (np.array(trial.light_values) for trial in trials)
         log_bayes_factor = (coarse_values - fine_values) / 2  # (1)
         supported = log_bayes_factor > VERY_STRONG
         total = float(log_bayes_factor.sum(where=supported) if supported.any() else log_bayes_factor.max())
         evidence.append(Decision(bool(supported.any()), log_bayes_factor=total))
-        if not supported.any():
+        for k, *pair, split in zip(candidates, *(trial.point.lights for trial in trials), supported, strict=True):
+            lights[k] = pair[int(split)]
+        candidates = [candidates[i] for i in np.flatnonzero(supported)]
+        if not candidates:
             break
-        # start from the radiance of the replaced cells: the trial's lights fit the previous materials
-        pairs = zip(fit.point.lights, finer, strict=True)
-        selected = [pair[int(split)] for pair, split in zip(pairs, supported, strict=True)]
-        fit = run.fit_and_report(phase, sample, fit.with_lights(selected), AFTER_SPLITTING)
-        if number == 0 and sample.fitted_loss(fit.point) < SMALL_LOSS:
-            observations = OBSERVATION_FACTOR * observations
-            sample = problem.subsample(observations, options.seed)
-            fit = run.fit_and_report(phase, sample, fit, AFTER_SPLITTING)
-    return msgspec.structs.replace(state.with_fit(fit, splitting=evidence), observations=observations)
+    return fit.with_lights(lights), evidence
 
 
 def split_brightest(light: Light) -> Light:

@@ -12,11 +12,11 @@ the radiance of their surroundings, and one lobe is added.  The lobe is as narro
 
 channel by channel, with t² the weight of the robust loss (0 where clipped and bright enough), A the whitened response.
 The residual is linear in w; z is searched over grids, coarse and then fine.  Then cells are fitted anew, around either
-lobe and alone.  The sun is kept if its light explains the observations better than cells alone, holds a share of the
-light, and is no bluer than all of it (`accept_sun`): air scatters blue light from the sun into the sky.  Natural light
-has suns, so the comparison with the wide lobe rejects one only if the evidence is clearly against it
-(`CLEARLY_AGAINST`).  All observations decide, not the held-out ones alone: a sun has five unknowns and replaces those
-of dozens of cells, so it hardly overfits.
+lobe and alone; a sun that gains too little in one step is not fitted further.  The sun is kept if its light explains
+the observations better than cells alone, holds a share of the light, and is no bluer than all of it (`accept_sun`): air
+scatters blue light from the sun into the sky.  Natural light has suns, so the comparison with the wide lobe rejects one
+only if the evidence is clearly against it (`CLEARLY_AGAINST`).  All observations decide, not the held-out ones alone: a
+sun has five unknowns and replaces those of dozens of cells, so it hardly overfits.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))
 # and 13, true suns hold 9 % of the light or more and lower the loss by 1.2 to 15 %.
 LEAST_SUN_GAIN = 0.01
 LEAST_SUN_SHARE = 0.07
+ONE_STEP = FitSchedule(light_steps=1, materials_fixed=True)
 AROUND_SUNS = FitSchedule(
     descents=(0, 2), least_temperature=0.1, temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True
 )
@@ -62,39 +63,45 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
         fit: Fit of the lights.
         run: Runner of the fits.
     """
-    without_suns = problem.illuminations(fit.point)
+    without_suns = problem.tabulated(fit.point)
     candidates = list(problem.spread(partial(replace_brightest, sharpness=SUN), without_suns))
     evidence = [Decision(bool(cells.light.suns.any())) for cells in without_suns]
     changed = [k for k, cells in enumerate(without_suns) if candidates[k] is not cells.light]
     if not changed:
         return Selection(fit, evidence)
 
-    def fit_anew(numbers: list[int], lights: list[Light]) -> tuple[list[Illumination], list[Hyperparameters]]:
+    def fit_anew(
+        numbers: list[int], lights: list[Light], schedule: FitSchedule = AROUND_SUNS
+    ) -> tuple[list[Illumination], list[Hyperparameters]]:
         """Fit some lights, by their numbers; return their illuminations and hyperparameters."""
         chosen = problem.select_lights(numbers)
         start = Fit(Point(fit.point.materials, lights), [fit.hyperparameters[k] for k in numbers])
-        result = run.fit_and_report("suns", chosen, start, AROUND_SUNS)
-        return chosen.illuminations(result.point), result.hyperparameters
+        result = run.fit("suns", chosen, start, schedule)
+        return chosen.tabulated(result.point), result.hyperparameters
 
-    # cells are fitted anew around each sun, and as much without it
-    alone, _ = fit_anew(changed, [fit.point.lights[k] for k in changed])
-    with_suns, weights = fit_anew(changed, [candidates[k] for k in changed])
-    for k, cells, sun in zip(changed, alone, with_suns, strict=True):
-        evidence[k] = accept_sun(cells, sun)
-    accepted = {k: n for n, k in enumerate(changed) if evidence[k].accepted}
-    if accepted:
-        # a wide lobe in place of each accepted sun
-        replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
-        wide, _ = fit_anew(list(accepted), list(problem.spread(replace_widely, [without_suns[k] for k in accepted])))
-        for (k, n), with_wide_lobe in zip(accepted.items(), wide, strict=True):
-            decision = compare_illuminations(with_wide_lobe, with_suns[n], CLEARLY_AGAINST)
-            evidence[k] = evidence[k] if decision.accepted else decision
+    # cells are fitted anew around each sun, and as much without it; for one step, and if that supports the sun, further
+    for schedule, share in ((ONE_STEP, 0.5), (AROUND_SUNS, 1.0)):
+        alone, _ = fit_anew(changed, [fit.point.lights[k] for k in changed], schedule)
+        with_suns, weights = fit_anew(changed, [candidates[k] for k in changed], schedule)
+        for k, cells, sun in zip(changed, alone, with_suns, strict=True):
+            evidence[k] = accept_sun(cells, sun, share)
+        pairs = zip(changed, with_suns, weights, strict=True)
+        kept = {k: (sun, its_weights) for k, sun, its_weights in pairs if evidence[k].accepted}
+        changed = list(kept)
+        if not kept:
+            return Selection(fit, evidence)
+    # a wide lobe in place of each accepted sun
+    replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
+    wide, _ = fit_anew(changed, list(problem.spread(replace_widely, [without_suns[k] for k in changed])))
     lights = list(fit.point.lights)
     hyperparameters = list(fit.hyperparameters)
-    for k, n in accepted.items():
-        if evidence[k].accepted:
-            lights[k] = with_suns[n].light
-            hyperparameters[k] = weights[n]
+    for (k, (sun, its_weights)), with_wide_lobe in zip(kept.items(), wide, strict=True):
+        decision = compare_illuminations(with_wide_lobe, sun, CLEARLY_AGAINST)
+        if decision.accepted:
+            lights[k] = sun.light
+            hyperparameters[k] = its_weights
+        else:
+            evidence[k] = decision
     return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 
@@ -146,17 +153,22 @@ def compare_illuminations(simpler: Illumination, richer: Illumination, least: fl
     return compare_models(losses[0], losses[1], least)
 
 
-def accept_sun(cells: Illumination, sun: Illumination) -> Decision:
+def accept_sun(cells: Illumination, sun: Illumination, share: float = 1.0) -> Decision:
     """Return the evidence for a sun; it is kept if the light with it is better than cells alone.
 
     The gain must exceed `WEAKLY_FOR` standard errors and the share `LEAST_SUN_GAIN` of the loss.  The sun must hold at
     least the share `LEAST_SUN_SHARE` of the light and be no bluer than all of it.
+
+    Args:
+        cells: Observations in the light of cells alone.
+        sun: Observations in the light with a sun.
+        share: Factor on the thresholds.
     """
-    evidence = compare_illuminations(cells, sun, WEAKLY_FOR)
-    accepted = evidence.accepted and gains(evidence, LEAST_SUN_GAIN)
+    evidence = compare_illuminations(cells, sun, share * WEAKLY_FOR)
+    accepted = evidence.accepted and gains(evidence, share * LEAST_SUN_GAIN)
     energy = sun.light.energy[sun.light.suns].sum(0)
     total = sun.light.energy.sum(0)
-    strong = energy.sum() >= LEAST_SUN_SHARE * total.sum()
+    strong = energy.sum() >= share * LEAST_SUN_SHARE * total.sum()
     warm = energy[2] * total[0] <= total[2] * energy[0]
     return msgspec.structs.replace(evidence, accepted=bool(accepted and strong and warm))
 

@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
 from factorlib.inference.fit import Fit, FitSchedule, fit_problem, light_likelihood, reliable_observations
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     CLEARLY_AGAINST,
@@ -60,7 +61,7 @@ from factorlib.inference.surface_turns import (
     solve_detail,
     zero_detail,
 )
-from factorlib.light.prior import LightPrior, read_light_prior
+from factorlib.light.prior import LightPrior
 from factorlib.results.materials import Decision
 
 # Stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it.
@@ -440,23 +441,17 @@ def fit_trial(
         surface: Subdivided meshes, and the attachment of each block to them.
         tick: Called at every evaluated point.
     """
-    prior = read_light_prior()
+    run = FitRunner(report=lambda event: tick())
     reliable = reliable_observations(problem)
-
-    def fitting(name: str, sample: JointProblem, start_fit: Fit, schedule: FitSchedule) -> Fit:
-        """Fit under the prior on lights."""
-        return fit_problem(sample, start_fit, prior, schedule, tick)
-
     choices = SolveOptions(self_shadowing="on", interreflection="on", seed=seed)
-    effects = select_effects(reliable, start(reliable, TRIAL_CELLS), choices, fitting)
+    effects = select_effects(reliable, start(reliable, TRIAL_CELLS), choices, run)
     lit = reliable.with_effects(effects.shadows.accepted, effects.interreflection.accepted)
-    selection = select_backgrounds(lit, effects.fit, choices, fitting)
+    selection = select_backgrounds(lit, effects.fit, choices, run)
     effects = effects.with_fit(selection.fit, backgrounds=selection.evidence)
     problem = effects.effective_problem(problem)
-    fit = fit_problem(
-        problem.subsample(OBSERVATIONS, seed), refine_cells(effects.fit, CELLS, problem), prior, START_SCHEDULE, tick
-    )
-    return DetailTrial(problem, fit, *surface, prior), InitialFit.from_fit(effects.fit, problem.blocks)
+    start_fit = refine_cells(effects.fit, CELLS, problem)
+    fit = run.fit("surface", problem.subsample(OBSERVATIONS, seed), start_fit, START_SCHEDULE)
+    return DetailTrial(problem, fit, *surface, run.prior), InitialFit.from_fit(effects.fit, problem.blocks)
 
 
 class ProgressSections(msgspec.Struct, frozen=True):

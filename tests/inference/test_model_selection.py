@@ -253,17 +253,18 @@ def test_models_that_predict_the_same_are_equal_evidence(begun_rooms, monkeypatc
         )
         for columns in (open_, {"place": lambda b: np.zeros((len(b), 3))})
     )
-    assert select_effects(shaded, [fit], QUICK, FitRunner().fit).shadows.margin == pytest.approx(0, abs=1e-6)
+    assert select_effects(shaded, [fit], QUICK, FitRunner()).shadows.margin == pytest.approx(0, abs=1e-6)
     guess = msgspec.structs.replace(fit, fitted=False)
-    assert select_effects(shaded, [guess], QUICK, FitRunner().fit).shadows.margin == pytest.approx(0, abs=1e-6)
-    for decision in select_distances(central, fit, QUICK, FitRunner().fit).evidence:
+    assert select_effects(shaded, [guess], QUICK, FitRunner()).shadows.margin == pytest.approx(0, abs=1e-6)
+    for decision in select_distances(central, fit, QUICK, FitRunner()).evidence:
         assert decision.log_bayes_factor == pytest.approx(0, abs=1e-6)
 
-    def without_curves(phase, model, start, schedule):
-        straight = [msgspec.structs.replace(light, log_tone=np.zeros(0)) for light in start.point.lights]
-        return FitRunner().fit(phase, model, start.with_lights(straight), schedule)
+    class WithoutCurves(FitRunner):
+        def fit(self, phase, model, start, schedule):
+            straight = [msgspec.structs.replace(light, log_tone=np.zeros(0)) for light in start.point.lights]
+            return super().fit(phase, model, start.with_lights(straight), schedule)
 
-    for decision in select_tone_curves(problem, fit, QUICK, without_curves).evidence:
+    for decision in select_tone_curves(problem, fit, QUICK, WithoutCurves()).evidence:
         assert decision.margin == pytest.approx(0, abs=1e-6)
     monkeypatch.setattr(suns, "replace_brightest", lambda one, sharpness: msgspec.structs.replace(one.light))
     for decision in select_suns(problem, fit, FitRunner()).evidence:
@@ -283,6 +284,7 @@ def test_what_is_held_out_judges_the_choices_and_is_fitted_after_them(monkeypatc
     assert fitted == {
         "no shadows": {False},
         "tone curves": {False},
+        "splitting": {True},
         "materials and lights": {True},
         "lights": {True},
         "suns": {True},
@@ -327,7 +329,7 @@ def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     blocks = photographed_at(0.2, 0.0, 0.2)
     result, far = (solved(blocks, MANY, tone="off", distance=distance) for distance in ("auto", "off"))
     assert [one.accepted for one in result.distances] == [True, False, True]
-    assert [light.curvature for light in result.point.lights] == [0.2, 0, 0.2]
+    assert [light.curvature for light in result.point.lights] == pytest.approx([0.2, 0, 0.2], abs=0.03)
     assert all(one.accepted == (one.log_bayes_factor > VERY_STRONG) for one in result.distances)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
     assert error_of(result) < 0.5 * error_of(far), (error_of(result), error_of(far))
@@ -349,7 +351,7 @@ def test_standard_errors_are_relative_to_the_reflectances_of_the_answer():
     assert np.abs(np.log(answer.specular / fitted.specular)).max() > 0.02  # the gauges differ
     errors, maps = estimate_uncertainty(solution, problem, QUICK)
     problem = problem.with_all_fitted()
-    sample = reliable_observations(problem).subsample(QUICK.observations, QUICK.seed)
+    sample = reliable_observations(problem).subsample(solution.observations, QUICK.seed)
     own = Posterior(sample, solution.materials, prior).with_prior()[1].materials
     for name in ("diffuse", "specular"):
         relative = getattr(errors.materials, name) / getattr(answer, name)

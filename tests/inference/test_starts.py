@@ -8,7 +8,7 @@ import pytest
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference import joint_solver, model_selection, splitting
+from factorlib.inference import joint_solver, model_selection
 from factorlib.inference.fit import FitSchedule
 from factorlib.inference.fit_runner import PHASES, Event, FitRunner, solve_progress
 from factorlib.inference.forward import Illumination
@@ -200,9 +200,9 @@ def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
 
 
 CHOICES = SolveOptions(cells=24, splittings=1, observations=100)
-PARTS = ("effects", "tone", "distances", "materials", "splitting", "prior", "lights", "suns")
+PARTS = ("effects", "tone", "distances", "materials", "prior", "lights", "suns")
 SHORT = ("lights",)  # of PARTS, those that make test kills after
-ALL = (*PHASES, "splitting 1", "prior", "lights", "suns")
+ALL = tuple(PHASES)
 
 
 class Killed(Exception):
@@ -217,7 +217,6 @@ def short():
         patch.setattr(model_selection, "DISTANCE_SCHEDULE", FitSchedule(descents=(2,), estimate_first=False))
         patch.setattr(model_selection, "TONE_SCHEDULE", FitSchedule(descents=(2,), estimate_first=False))
         patch.setattr(joint_solver, "MATERIALS", FitSchedule(2, (2,)))
-        patch.setattr(splitting, "AFTER_SPLITTING", FitSchedule(1, (2,)))
         patch.setattr(joint_solver, "LIGHTS", FitSchedule(descents=(0, 2), materials_fixed=True))
         yield
 
@@ -285,9 +284,12 @@ def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp
 def test_every_part_reports_what_it_does(whole):
     _, events = whole
     visibilities = [event.phase for event in events]
-    assert set(visibilities) <= set(ALL) and set(ALL) - {"shadows and bounces", "background", "suns"} <= set(
-        visibilities
-    )
+    assert set(visibilities) <= set(ALL) and set(ALL) - {
+        "shadows and bounces",
+        "background",
+        "distances",
+        "suns",
+    } <= set(visibilities)
     assert sorted(visibilities, key=ALL.index) == visibilities and all(np.isfinite(event.loss) for event in events)
     assert [event.round for event in events] == sorted(event.round for event in events)
 
@@ -311,11 +313,11 @@ def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_t
 
 def test_progress_never_goes_back_moves_with_every_point_and_is_whole_only_at_the_end():
     """With three starts each model is fitted three times: the first phases are entered anew."""
-    shares, effects, later = [], list(PHASES)[:3], [*list(PHASES)[3:], "splitting 1", "splitting 2", "lights", "suns"]
-    report = solve_progress(lambda done, total, text: shares.append(done / total), SolveOptions(splittings=2))
+    shares, effects, later = [], list(PHASES)[:3], list(PHASES)[3:]
+    report = solve_progress(lambda done, total, text: shares.append(done / total))
     for phase in [*(one for one in effects for _ in range(3)), *later]:
-        for iteration in (*range(12), -1):
+        for iteration in range(13):
             report(Event(0, phase, iteration, 1.0, float("nan"), 400))
         if phase in later:
             assert len(set(shares[-13:])) >= 12
-    assert shares == sorted(shares) and 0 < shares[0] < 0.01 and 0.99 < shares[-1] < 1
+    assert shares == sorted(shares) and 0 < shares[0] < 0.01 and 0.9 < shares[-1] < 1
