@@ -288,6 +288,7 @@ def test_every_part_reports_what_it_does(whole):
         "shadows and bounces",
         "background",
         "distances",
+        "more observations",
         "suns",
     } <= set(visibilities)
     assert sorted(visibilities, key=ALL.index) == visibilities and all(np.isfinite(event.loss) for event in events)
