@@ -52,8 +52,8 @@ CLOSER = FitSchedule(light_steps=2, descents=(3, 2), estimate_first=False)
 # Where the model explains the fitted observations closely, errors of few observations matter: k_d of data/synthetic is
 # 13 % wrong with 1,000, 2.6 % with 4,000 and 1.0 % with 8,000.
 OBSERVATION_FACTOR = 8  # factor on the number of observations there
-# Mean robust loss of a fitted value below which it does, after a splitting: 0.1 to 0.2 on exact sets, at least 0.5 on 17
-# sets of rendered photographs with wrong normals.
+# Mean robust loss of a fitted value below which it does, after a splitting: 0.1 to 0.2 on exact sets, at least 0.5 on
+# 17 sets of rendered photographs with wrong normals.
 SMALL_LOSS = 0.3
 LIGHTS = FitSchedule(
     descents=(0, 2, 2), least_temperature=0.1, temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True

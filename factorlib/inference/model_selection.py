@@ -205,7 +205,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     fit, losses = fit_best(*with_shadows)
     decision = Decision(True)
     if shadows == "auto" and not problem.none_held_out:
-        bare = run.fit("no shadows", sample.with_effects(False, False), fit, ONE_STEP)
+        bare = run.fit("shadows", sample.with_effects(False, False), fit, ONE_STEP)
         bare_losses = held_out_losses(sample.with_effects(False, False), bare.point)
         decision = compare_models(bare_losses, losses, CLEARLY_AGAINST)
         if (decision.margin or 0.0) < CLEARLY_FOR:  # both continue from one fit
@@ -345,8 +345,8 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
             run.fit("tone curves", sample, start.with_lights(lights), schedule)
             for lights in (start.point.lights, freed)
         )
-        losses = [held_out_losses(sample, fit.point) for fit in (plain, curved)]
-        pairs = ([each.one_light(k) for each in losses] for k in range(len(freed)))
+        without, with_curves = (held_out_losses(sample, fit.point) for fit in (plain, curved))
+        pairs = ((without.one_light(k), with_curves.one_light(k)) for k in range(len(freed)))
         return plain, curved, [compare_models(*pair, CLEARLY_FOR) for pair in pairs]
 
     plain, curved, compared = compare(ONE_STEP)
@@ -408,8 +408,8 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
     far = dict.fromkeys(near, 0.0)
     far_fit, near_fit = (fit_with_curvatures(curvatures) for curvatures in (far, near))
     given_materials = [fit_with_curvatures(curvatures, near_fit, LIGHTS_ONLY) for curvatures in (far, near)]
-    pairs = (far_fit, near_fit), given_materials
-    factor = np.min([(np.array(a.light_values) - b.light_values) / 2 for a, b in pairs], axis=0)
+    values = np.array([fit.light_values for fit in (far_fit, near_fit, *given_materials)])
+    factor = np.minimum(values[0] - values[1], values[2] - values[3]) / 2
     for k in near:
         evidence[k] = Decision(bool(factor[k] > VERY_STRONG), log_bayes_factor=float(factor[k]))
     curvatures = {k: c * near_share(factor[k]) for k, c in near.items() if evidence[k].accepted}

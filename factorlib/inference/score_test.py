@@ -108,13 +108,12 @@ class ScoreTest:
 
     def predict(self, effects: list[dict[int, EffectTerms]], most: float) -> list[Predicted]:
         """Return the predictions for effects of sizes 0 to `most`, given the terms of each by number of the light."""
-        nothing = [np.zeros_like(each.by_light) for each in self.gradients]
         vectors = []  # b_j
         for terms in effects:
-            by_materials = sum(each.by_materials for each in terms.values())
-            vectors.append(
-                (by_materials, [terms[k].by_light if k in terms else zero for k, zero in enumerate(nothing)])
-            )
+            by_materials = np.sum([each.by_materials for each in terms.values()], axis=0)
+            lights = enumerate(self.gradients)
+            by_lights = [terms[k].by_light if k in terms else np.zeros_like(each.by_light) for k, each in lights]
+            vectors.append((by_materials, by_lights))
         solved = [self.arrow.solve(*vector) for vector in vectors]
         curvatures = np.diag([sum(each.curvature for each in terms.values()) for terms in effects])
         C = curvatures - [[_dot(vector, x) for x in solved] for vector in vectors]
