@@ -30,7 +30,6 @@ PoseRow = tuple[Number, Number, Number, Number]
 LIGHT_FILES = (".hdr", ".exr")
 BALL = "ball"
 MOST_REFLECTED = 0.999  # largest max diffuse + max specular: with more, light between surfaces does not decay
-DENOISER = "mitsuba_oidn"  # name of the module
 CURE = (
     'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b], "roughness": 0.2}}}, '
     "numbers from 0 to 1"
@@ -42,8 +41,6 @@ class BaseRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     samples: Samples = 256
     """Samples per pixel of the path tracer; the noise falls with their square root."""
-    denoise: bool = False
-    """Remove the remaining noise by Intel Open Image Denoise (the extra `denoise`)."""
 
 
 class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 from factorlib.dataset.check import MESHES
@@ -56,12 +55,6 @@ def check_recipe(
                 file=path,
                 cure=f"paths are relative to the recipe; meshes without a file are {', '.join([BALL, *meshes])}",
             )
-    if recipe.denoise and find_spec(kinds.DENOISER) is None:
-        refuse(
-            "denoise",
-            "the denoiser is not installed",
-            "make setup EXTRAS=denoise (outside a checkout: pip install mitsuba-oidn), or remove `denoise`",
-        )
     if isinstance(recipe, kinds.PhotoRecipe):
         _check_photos(recipe, photos, refuse)
     if isinstance(recipe, kinds.RelightRecipe | kinds.GridRecipe):

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
-from factorlib.export.exported_scene import DIRECT
 from factorlib.geometry.ground import Plane, resting_plane
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
 from factorlib.results.materials import Reflectance
@@ -21,7 +20,6 @@ from factorlib.tracing.scene import bsdf, rigid, transform
 REACH = 3.0  # radius of a floor, in half extents of the objects
 SOLID = 0.3  # share of the radius within which the floor does not fade
 HAIR = 1e-4  # depth of the floor below the plane, in half extents: surfaces must not touch
-COVERAGE_SAMPLES = 16
 
 
 def ground_below(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
@@ -85,7 +83,6 @@ def on_floor(
     reflectance: float,
     samples: int,
     world_from_camera: Float[np.ndarray, "4 4"],
-    with_light: bool = False,
 ) -> Float[np.ndarray, "h w 4"]:
     """Render the objects on a Lambertian floor, as `traced_photo` does without one.
 
@@ -95,7 +92,6 @@ def on_floor(
         reflectance: the floor's reflectance
         samples: samples per pixel
         world_from_camera: pose of the camera, in OpenCV's axes
-        with_light: show the light behind the objects
 
     Returns:
         Linear radiance times coverage, and coverage.
@@ -111,9 +107,9 @@ def on_floor(
     grey = Reflectance((reflectance,) * 3, (0.0,) * 3, 1.0)
     floor = disk(foot - HAIR * extent * plane.normal, plane.normal, REACH * extent, grey)
     # L₀, L₁ and W
-    without = traced_photo(scene, samples, world_from_camera, with_light)
-    with_floor = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
-    coverage = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
+    without = traced_photo(scene, samples, world_from_camera)
+    with_floor = traced_photo(scene, samples, world_from_camera, {"floor": floor})
+    coverage = without[..., 3]
     # f, from the distance between the foot of the objects and the floor point of each pixel
     eye = world_from_camera[:3, 3]
     rays = (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)

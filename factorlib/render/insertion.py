@@ -25,28 +25,30 @@ out toward the rim of the disc, beyond which the geometry of the scene is unknow
 """
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_erosion, distance_transform_edt
+from scipy.ndimage import binary_erosion, distance_transform_edt, uniform_filter
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.export.exported_scene import ALL_BOUNCES
+from factorlib.geometry.camera import Camera
 from factorlib.geometry.ground import Plane
-from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.ply_stl_off import submesh
+from factorlib.meshes.mesh import without_paint
 from factorlib.render.ground import disk, height_over, smooth_step
-from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
+from factorlib.render.photo_scene import CAMERA_POSE, PhotoScene, PlacedMesh, light_entries, shapes, visible_window
 from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3
-from factorlib.tracing.scene import Channels, denoise_picture, render_scene, rgb, rigid, sensor, shape
+from factorlib.tracing.scene import denoise_picture, render_scene, rgb, sensor
 
 FADE = 0.5  # outer share of the disc's radius in which shadows fade
-FIT_SAMPLES = 16
+PREVIEW = 160  # columns of a preview, which tells the ground's colour and the reach of the new object
+PREVIEW_SAMPLES = 64
+LEAST_CHANGE = 0.005  # relative change of radiance that counts as reached: a quarter of a step of 8-bit sRGB
 GREY = 0.3  # default diffuse reflectance of the ground
 DARKEST = 0.02  # least diffuse reflectance of the ground
 BRIGHTEST = 0.85  # largest diffuse reflectance of the ground
@@ -60,6 +62,7 @@ FEWEST = 100  # least number of pixels for a comparison of shadows
 BELIEVED = 0.3
 GROUND = "+ground"
 BLACK = Reflectance((0.0,) * 3, (0.0,) * 3, 1.0)
+WHITE = Reflectance((1.0,) * 3, (0.0,) * 3, 1.0)
 STEPS = 4
 NEW = "+"  # prefix of the new object and its materials: no name in dataset.yaml has it
 
@@ -117,9 +120,19 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
         return light_entries(scene.light, scene.size), shapes(scene.objects, scene.materials)
 
     @property
-    def sensor(self) -> dict[str, Any]:
-        """The photo's camera, for Mitsuba."""
-        return sensor(self.scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near_clip=self.scene.near_clip)
+    def fade(self) -> Float[np.ndarray, "h w"]:
+        """The weight of the shadow: 1 near the spot and above the horizon, and smoothly 0 at the rim of the disc."""
+        return smooth_step((1 - np.where(np.isinf(self.distance), 0, self.distance)) / (1 - FADE))
+
+    @property
+    def preview(self) -> tuple[Camera, tuple[slice, slice]]:
+        """A camera of about PREVIEW columns, and the rows and columns of the photo at the middles of its pixels."""
+        camera = self.scene.camera
+        pixel = max(1, camera.width // PREVIEW)
+        height = camera.height // pixel
+        width = camera.width // pixel
+        middles = slice(pixel // 2, pixel * height, pixel), slice(pixel // 2, pixel * width, pixel)
+        return camera.window(0, 0, pixel, width, height), middles
 
     def disc(self, material: Reflectance) -> dict[str, Any]:
         """Return the ground about the spot as a Mitsuba disk."""
@@ -127,28 +140,30 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
         centre = self.spot.point - HAIR * self.spot.height * normal
         return {GROUND: disk(centre, normal, RADIUS * self.spot.height, material)}
 
-    def radiance(
+    def sensor(self, camera: Camera) -> dict[str, Any]:
+        """Return a camera at the photo's place, for Mitsuba."""
+        return sensor(camera, CAMERA_POSE, near_clip=self.scene.near_clip, alpha=True)
+
+    def render(
         self,
         entries: dict[str, Any],
-        samples: int,
+        camera: Camera,
+        samples: int = PREVIEW_SAMPLES,
         seed: int = 1,
         light: dict[str, Any] | None = None,
-        guides: bool = False,
-    ) -> Float[np.ndarray, "h w c"]:
-        """Render the photo's objects with further entries.
+    ) -> Float[np.ndarray, "h w 10"]:
+        """Render the photo's objects with further entries, as `denoise_picture` takes it.
 
         Args:
             entries: Mitsuba objects by name
+            camera: a camera at the photo's place
             samples: samples per pixel
             seed: seed of the random numbers
             light: replaces the photo's light
-            guides: add the guides of the denoiser
         """
         photo_light, objects = self.entries
-        channels = Channels(hide_emitters=True, guides=guides)
-        return render_scene(
-            (light or photo_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels
-        )
+        everything = (light or photo_light) | objects | entries
+        return render_scene(everything, self.sensor(camera), samples, seed, ALL_BOUNCES, guides=True)
 
 
 class ShadowMatch(msgspec.Struct, frozen=True):
@@ -188,18 +203,16 @@ class InsertionResult(msgspec.Struct, frozen=True):
     """A photo with the new object.
 
     Attributes:
-        composite: (2), linear radiance
+        composite: (2), linear radiance; the photo itself outside the reach of the object
         coverage: α
         shadow: s of (1)
         ground: diffuse reflectance used for the ground
-        without: L₀
     """
 
     composite: Picture
     coverage: Float[np.ndarray, "h w"]
     shadow: Picture
     ground: Float[np.ndarray, "3"]
-    without: Picture
 
 
 def insert_object(
@@ -224,66 +237,66 @@ def insert_object(
         InputError: The new object is not visible.
     """
     new = shapes([insertion.new], insertion.scene.materials)
-    coverage = _coverage(insertion, samples)
-    report(1)
     shows_ground = (insertion.distance < 1) & ~covered
     diffuse = insertion.ground.diffuse or _ground_colour(insertion, photo, shows_ground, seed)
+    grounds = [insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))]
+    if insertion.ground.polish is not None:
+        grounds.append(insertion.disc(insertion.ground.polish))
+    report(1)
+    window = _reach(insertion, grounds, new, seed)
     report(2)
-    # weight that falls smoothly from 1 near the spot, and above the horizon, to 0 at the rim of the disc
-    fade = smooth_step((1 - np.where(np.isinf(insertion.distance), 0, insertion.distance)) / (1 - FADE))[..., None]
+    camera = insertion.scene.camera.crop(*window)
+    coverage = _coverage(insertion, camera, samples, seed)
     background = (1 - coverage)[..., None]
-    disc = insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))
-    rendering = partial(insertion.radiance, samples=samples, seed=seed)
-    without, with_object, shadow = _lighting(
-        [rendering(e, guides=insertion.scene.denoise) for e in (disc, disc | new)], coverage, fade
-    )
+    fade = insertion.fade[window][..., None]
+    pairs = [[insertion.render(e, camera, samples, seed) for e in (ground, ground | new)] for ground in grounds]
     report(3)
     # (2)
-    gain = np.maximum(with_object - background * shadow * without, 0) * (background < 1)
-    composite = background * shadow * photo + gain
+    shadow = _shadow(*pairs[0], coverage, fade)
+    gain = denoise_picture(pairs[0][1])[..., :3] - background * shadow * pairs[0][0][..., :3]
+    changed = background * shadow * photo[window] + np.maximum(gain, 0) * (background < 1)
     # change of the ground's specular part: the object's reflection in it
-    if insertion.ground.polish is not None:
-        polished = insertion.disc(insertion.ground.polish)
-        mirrored = rendering(polished | new) - rendering(polished)
-        composite = np.maximum(composite + mirrored * shows_ground[..., None] * background * fade, 0)
+    for without, with_object in pairs[1:]:
+        mirrored = (denoise_picture(with_object) - denoise_picture(without))[..., :3]
+        mirrored *= (with_object != without)[..., :3] * shows_ground[window][..., None]
+        changed = np.maximum(changed + mirrored * background * fade, 0)
+    result = InsertionResult(photo.copy(), np.zeros(covered.shape), np.ones_like(photo), np.asarray(diffuse))
+    for whole, part in ((result.composite, changed), (result.coverage, coverage), (result.shadow, shadow)):
+        whole[window] = part
     report(STEPS)
-    return InsertionResult(composite, coverage, shadow, np.asarray(diffuse), without)
+    return result
 
 
-def _lighting(
-    renderings: Sequence[Float[np.ndarray, "h w c"]],
+def _shadow(
+    without: Float[np.ndarray, "h w 10"],
+    with_object: Float[np.ndarray, "h w 10"],
     coverage: Float[np.ndarray, "h w"],
     fade: Float[np.ndarray, "h w 1"],
-) -> tuple[Picture, Picture, Picture]:
-    """Return L₀ and L₁, denoised if the renderings have guides, and s of (1).
+) -> Picture:
+    """Return s of (1), denoised, but exactly 1 where no path meets the object.
 
     s is that of the nearest pixel beside the object for pixels under it and 1 for unlit pixels, and fades to 1 toward
     the rim of the disc.
 
     Args:
-        renderings: the scene without and with the new object
+        without: rendering of the scene without the object
+        with_object: rendering with it
         coverage: α
         fade: weight of the shadow
     """
-    (without, guides_without), (with_object, guides_with) = (np.split(each, [3], axis=-1) for each in renderings)
     with np.errstate(divide="ignore", invalid="ignore"):
-        shadow = np.where(without > 0, with_object / without, 1.0)
+        shadow = np.where(without[..., :3] > 0, with_object[..., :3] / without[..., :3], 1.0)
     uncovered = coverage == 0
     if uncovered.any():
         row, column = distance_transform_edt(~uncovered, return_distances=False, return_indices=True)
         shadow = shadow[row, column]
     shadow = 1 + (shadow - 1) * fade
-    if guides_with.size:  # not the photo, nor pixels whose paths miss the object
-        clean, with_object = (
-            denoise_picture(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
-            for noisy, guides in ((shadow, guides_without), (with_object, guides_with))
-        )
-        shadow = np.where(shadow == 1, 1, clean)
-    return without, with_object, shadow
+    clean = denoise_picture(np.concatenate([shadow, np.ones_like(fade), without[..., 4:]], axis=-1))[..., :3]
+    return np.where(shadow == 1, 1, clean)
 
 
 def compare_shadow(
-    insertion: InsertionScene, result: InsertionResult, photo: Picture, covered: Bool[np.ndarray, "h w"], samples: int
+    insertion: InsertionScene, result: InsertionResult, photo: Picture, covered: Bool[np.ndarray, "h w"]
 ) -> ShadowMatch:
     """Compare the photo's own shadow with L₀, on the ground near its objects.
 
@@ -292,7 +305,6 @@ def compare_shadow(
         result: its rendering
         photo: linear radiance, with the tone curve undone
         covered: pixels that show something other than the ground
-        samples: samples per pixel of the rendering
     """
     plane = insertion.spot.plane
     near = [
@@ -300,42 +312,65 @@ def compare_shadow(
         < NEAR * height_over(plane, each)
         for each in insertion.scene.objects
     ]
-    shows_ground = (insertion.distance < 1) & ~covered & np.any(near, axis=0)
+    shows_ground = binary_erosion((insertion.distance < 1) & ~covered & np.any(near, axis=0), iterations=RIM)
     disc = insertion.disc(Reflectance(vec3(result.ground), (0.0,) * 3, 1.0))
     sky = {"light": {"type": "constant", "radiance": rgb(1.0)}}
-    constant = insertion.radiance(disc, samples, light=sky)
-    return shadow_match(photo, result.without, constant, binary_erosion(shows_ground, iterations=RIM))
+    camera, middles = insertion.preview
+    lit, constant = (insertion.render(disc, camera, light=light)[..., :3] for light in (None, sky))
+    return shadow_match(photo[middles], lit, constant, shows_ground[middles])
 
 
 def _ground_colour(
     insertion: InsertionScene, photo: Picture, shows_ground: Bool[np.ndarray, "h w"], seed: int
 ) -> tuple[float, float, float]:
     """Return the diffuse reflectance at which the ground matches the photo: the median over its pixels."""
-    lit = insertion.radiance(insertion.disc(Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES, seed)
-    usable = shows_ground & (lit.min(axis=-1) > 0)
+    camera, middles = insertion.preview
+    grey = insertion.disc(Reflectance((GREY,) * 3, (0.0,) * 3, 1.0))
+    lit = insertion.render(grey, camera, seed=seed)[..., :3]
+    usable = shows_ground[middles] & (lit.min(axis=-1) > 0)
     if not usable.any():
         return (GREY,) * 3
-    return vec3(np.clip(GREY * np.median(photo[usable] / lit[usable], axis=0), DARKEST, BRIGHTEST))
+    return vec3(np.clip(GREY * np.median(photo[middles][usable] / lit[usable], axis=0), DARKEST, BRIGHTEST))
 
 
-def _coverage(insertion: InsertionScene, samples: int) -> Float[np.ndarray, "h w"]:
-    """Render the new object with radiance 1 and all else black, so that a pixel is the object's share of it.
+def _reach(
+    insertion: InsertionScene, grounds: Sequence[dict[str, Any]], new: dict[str, Any], seed: int
+) -> tuple[slice, slice]:
+    """Return the rows and columns of the pixels that the new object, its shadow or its reflection can reach.
 
-    Area lights emit on the side of their normals alone.  An open mesh gets a second light, flipped and slightly behind.
+    A preview without and with the object tells the pixels that change by more than LEAST_CHANGE.
+
+    Args:
+        insertion: the scene and the new object's place
+        grounds: Mitsuba's entries of the ground, diffuse and polished
+        new: Mitsuba's entries of the new object
+        seed: seed of the random numbers
     """
-    new = insertion.new
-    entries = shapes(insertion.scene.objects, dict.fromkeys(insertion.scene.materials, BLACK))
-    surface = {"type": "diffuse", "reflectance": rgb(0.0)}
-    emitter = {"type": "area", "radiance": rgb(1.0)}
-    for label in new.mesh.labels:
-        part = submesh(new.mesh, label)
-        sides = [part]
-        if new.mesh.open:
-            inner = part.vertices - HAIR * new.mesh.radius * part.normals
-            sides.append(Mesh(inner, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True))
-        for number, side in enumerate(sides):
-            entries[f"{new.name}_{label}_{number}"] = shape(side, surface, new.world_from_object, emitter)
-    coverage = np.clip(render_scene(entries, insertion.sensor, samples, 1, 1)[..., 0], 0, 1)
+    camera, middles = insertion.preview
+    changed = np.zeros((camera.height, camera.width), bool)
+    changed[visible_window(insertion.new.vertices, camera, CAMERA_POSE)] = True
+    for ground in grounds:
+        without, with_object = (insertion.render(e, camera, seed=seed)[..., :3] for e in (ground, ground | new))
+        change = np.abs(with_object - without) * insertion.fade[middles][..., None]
+        # means of 3 × 3 pixels
+        change, level = (uniform_filter(each, (3, 3, 1)) for each in (change, without))
+        changed |= (change > LEAST_CHANGE * level).any(axis=-1)
+    pixel = middles[0].step
+    spans = [np.flatnonzero(changed.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0)]
+    rows, columns = (slice(max(0, pixel * (low - 1)), pixel * (high + 2)) for low, high in spans)
+    return slice(rows.start, min(rows.stop, len(insertion.distance))), slice(
+        columns.start, min(columns.stop, insertion.distance.shape[1])
+    )
+
+
+def _coverage(insertion: InsertionScene, camera: Camera, samples: int, seed: int) -> Float[np.ndarray, "h w"]:
+    """Render the albedo of the new object in white and all else in black, which is the object's share of each pixel."""
+    new = msgspec.structs.replace(insertion.new, mesh=without_paint(insertion.new.mesh, insertion.new.mesh.labels))
+    materials = insertion.scene.materials
+    entries = shapes(insertion.scene.objects, dict.fromkeys(materials, BLACK)) | shapes(
+        [new], dict.fromkeys(materials, WHITE)
+    )
+    coverage = np.clip(render_scene(entries, insertion.sensor(camera), samples, seed, 1, guides=True)[..., 4], 0, 1)
     if not coverage.any():
         raise InputError(
             "the new object is invisible: it stands outside the picture, or other objects hide it",

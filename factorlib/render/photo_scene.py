@@ -28,7 +28,6 @@ from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import (
     NARROWEST,
-    Channels,
     bsdf,
     denoise_picture,
     envmap,
@@ -47,6 +46,9 @@ NEAR = 1e-3  # near clipping distance, in distances of the objects
 FAR = 3e3  # distance of suns, in sizes of the scene
 LOBE_ROWS = 256  # rows of Mitsuba's map of lobes
 MAP_ROWS = 1024  # rows of Mitsuba's map of a lat-long map
+
+LIGHT_SAMPLES = 16  # samples per pixel of the light behind objects, which is smooth
+CAMERA_POSE = rigid(YUP_FROM_CAMERA, np.zeros(3))  # the photo's camera in the world
 
 DistantLight = Lobes | Float[np.ndarray, "h w 3"]
 
@@ -75,7 +77,6 @@ class PhotoScene(msgspec.Struct, frozen=True):
 
     Attributes:
         max_depth: ALL_BOUNCES or DIRECT, as in the solve
-        denoise: True if renderings of the scene are denoised
     """
 
     camera: Camera
@@ -83,7 +84,6 @@ class PhotoScene(msgspec.Struct, frozen=True):
     light: DistantLight
     materials: Mapping[str, Reflectance]
     max_depth: int = ALL_BOUNCES
-    denoise: bool = False
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
@@ -156,41 +156,60 @@ def shapes(objects: Sequence[PlacedMesh], materials: Mapping[str, Reflectance]) 
     return entries
 
 
+def visible_window(
+    points: Float[np.ndarray, "n 3"], camera: Camera, world_from_camera: Float[np.ndarray, "4 4"]
+) -> tuple[slice, slice]:
+    """Return the rows and columns that show the points, at least one of each; all if a point is behind the camera."""
+    points = (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    size = np.array([camera.width, camera.height])
+    if points[:, 2].min() <= 0:
+        return slice(0, camera.height), slice(0, camera.width)
+    pixels = camera.project(points)
+    low = np.clip(np.floor(pixels.min(axis=0)), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=0)), low + 1, size).astype(int)
+    columns, rows = (slice(*span) for span in np.stack([low, high], axis=1).tolist())
+    return rows, columns
+
+
 def traced_photo(
     scene: PhotoScene,
     samples: int,
-    world_from_camera: Float[np.ndarray, "4 4"] | None = None,
-    with_light: bool = False,
-    extra_entries: Mapping[str, Any] = {},
-    max_depth: int | None = None,
+    world_from_camera: Float[np.ndarray, "4 4"] = CAMERA_POSE,
+    floor: Mapping[str, Any] = {},
 ) -> Float[np.ndarray, "h w 4"]:
-    """Render the scene by path tracing.
+    """Render the objects by path tracing, denoised; without a floor, only the pixels that can show them.
 
     Args:
         scene: the scene
         samples: samples per pixel
         world_from_camera: pose of the camera, in OpenCV's axes; by default the photo's own
-        with_light: show the light behind the objects
-        extra_entries: further entries of the scene, for Mitsuba
-        max_depth: replaces the scene's own
+        floor: further entries of the scene, for Mitsuba
 
     Returns:
-        Linear radiance times coverage, and coverage: the share of a pixel that objects, or the visible light, fill.
+        Linear radiance times coverage, and coverage: the share of a pixel that objects fill.
     """
-    pose = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
-    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **extra_entries}
-    view = sensor(scene.camera, pose, near_clip=scene.near_clip, alpha=True)
-    depth = scene.max_depth if max_depth is None else max_depth
-    channels = Channels(hide_emitters=not with_light, guides=scene.denoise)
-    picture = render_scene(entries, view, samples, 0, depth, channels)
-    if with_light:
-        picture[..., 3] = 1
-    return denoise_picture(picture) if scene.denoise else picture
+    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **floor}
+    points = np.concatenate([each.vertices for each in scene.objects])
+    window = visible_window(points, scene.camera, world_from_camera)
+    if floor:
+        window = slice(0, scene.camera.height), slice(0, scene.camera.width)
+    view = sensor(scene.camera.crop(*window), world_from_camera, near_clip=scene.near_clip, alpha=True)
+    picture = np.zeros((scene.camera.height, scene.camera.width, 4))
+    picture[window] = denoise_picture(render_scene(entries, view, samples, 0, scene.max_depth, guides=True))
+    return picture
 
 
-def lit_ball(
-    light: DistantLight, material: Reflectance, size: int, samples: int, denoise: bool = False
+def before_light(
+    picture: Float[np.ndarray, "h w 4"], scene: PhotoScene, world_from_camera: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "h w 4"]:
+    """Return a picture of objects with the scene's light behind them."""
+    view = sensor(scene.camera, world_from_camera, near_clip=scene.near_clip)
+    light = render_scene(light_entries(scene.light, scene.size), view, LIGHT_SAMPLES, 0, 1)
+    uncovered = 1 - picture[..., 3:]
+    return np.concatenate([picture[..., :3] + uncovered * light, np.ones_like(uncovered)], axis=-1)
+
+
+def lit_ball(light: DistantLight, material: Reflectance, size: int, samples: int) -> Float[np.ndarray, "h w 4"]:
     """Render a ball that fills the picture, seen from the front.
 
     Args:
@@ -198,7 +217,6 @@ def lit_ball(
         material: the ball's reflectance
         size: width and height of the picture, in pixels
         samples: samples per pixel
-        denoise: denoise the picture
 
     Returns:
         Linear radiance times coverage, and coverage.
@@ -208,10 +226,10 @@ def lit_ball(
     focal = size / 2 * np.sqrt(distance**2 - 1)
     camera = Camera(size, size, focal, (size / 2, size / 2))
     sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
-    view = sensor(camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), alpha=True)
     entries = {**light_entries(light, distance), "ball": sphere}
-    picture = render_scene(entries, view, samples, 0, DIRECT, Channels(hide_emitters=True, guides=denoise))
-    return denoise_picture(picture) if denoise else picture
+    return denoise_picture(
+        render_scene(entries, sensor(camera, CAMERA_POSE, alpha=True), samples, 0, DIRECT, guides=True)
+    )
 
 
 def resize_scene(scene: PhotoScene, width: int | None) -> PhotoScene:

@@ -19,6 +19,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
 from factorlib.images.film import write_gif, write_mp4
+from factorlib.images.grain import add_grain
 from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import without_paint
@@ -30,6 +31,7 @@ from factorlib.render.photo_scene import (
     Orbit,
     PhotoScene,
     TracedPicture,
+    before_light,
     lit_ball,
     resize_scene,
     rotate_light,
@@ -39,7 +41,6 @@ from factorlib.render.placement import free_placement, spot_beside, standing_mes
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
-from factorlib.tracing.scene import denoiser
 from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.recipes")
@@ -48,7 +49,6 @@ SUN = (
     "and holds {sun.strength:.0%} of the light's energy, which is kept."
 )
 CONTRADICTED = "the ground that the photo shows is not shaded as the recovered light predicts"
-DENOISED = "Denoised by {denoiser}, from {recipe.samples} samples a pixel."
 
 
 def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
@@ -75,9 +75,6 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
             if recipe.sun is not None:
                 facts["assumed_sun"] = msgspec.to_builtins(recipe.sun)
                 captions.append(SUN.format(sun=recipe.sun))
-            if recipe.denoise:
-                facts["denoised"] = denoiser()
-                captions.append(DENOISED.format(recipe=recipe, denoiser=denoiser()))
             if facts:
                 write_json(out / f"{photo}.json", {**facts, "caption": " ".join(captions)})
         except InputError as error:
@@ -113,7 +110,7 @@ def write_resynthesis(
         report: receives the share that is done, in [0, 1]
     """
     report(0)
-    scene = results.scene(photo, recipe.sun, recipe.denoise)
+    scene = results.scene(photo, recipe.sun)
     if isinstance(recipe, kinds.TransferRecipe):
         table = results.with_table(recipe.table)
         replaced = {old: table[new] for old, new in recipe.materials.items()}
@@ -149,7 +146,7 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
     Raises:
         InputError: The photo shows no place for the object, or the assumed sun stands below the ground.
     """
-    scene = results.scene(photo, recipe.sun, recipe.denoise)
+    scene = results.scene(photo, recipe.sun)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
     polished = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
     polish = polished if any(recipe.ground.specular) else None
@@ -204,12 +201,13 @@ def write_insertion(
     linear = results.linear_photo(photo)
     covered = results.photo_mask(photo)
     result = insert_object(insertion, linear, covered, recipe.samples, lambda done: report(done / STEPS))
-    match = compare_shadow(insertion, result, linear, covered, recipe.samples)
+    match = compare_shadow(insertion, result, linear, covered)
     if match.doubtful:
         log.warning("%s: do not trust the shadow: %s", photo, CONTRADICTED)
     # Pixels that the new object does not change keep the photo's values exactly.
-    unchanged = (result.coverage[..., None] == 0) & (result.shadow == 1) & (insertion.ground.polish is None)
-    _write_opaque(out / photo, np.where(unchanged, results.photo(photo), results.tone(photo)(result.composite)))
+    original = results.photo(photo)
+    picture = np.where(result.composite == linear, original, results.tone(photo)(result.composite))
+    _write_opaque(out / photo, add_grain(picture, original, result.coverage))
     pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
     source = "that of dataset.yaml"
     if results.grounds[photo].ground is None:
@@ -246,11 +244,14 @@ def render_view(
     Returns:
         Linear radiance times coverage, and coverage.
     """
-    lit = recipe.background == "light"
     if recipe.floor is None:
-        return traced_photo(scene, recipe.samples, view(scene), lit)
-    plane = results.ground(photo, scene.objects[0]).plane
-    return on_floor(scene, plane, recipe.floor, recipe.samples, view(scene, plane.normal), lit)
+        pose = view(scene)
+        traced = traced_photo(scene, recipe.samples, pose)
+    else:
+        plane = results.ground(photo, scene.objects[0]).plane
+        pose = view(scene, plane.normal)
+        traced = on_floor(scene, plane, recipe.floor, recipe.samples, pose)
+    return before_light(traced, scene, pose) if recipe.background == "light" else traced
 
 
 def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -264,7 +265,7 @@ def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Pa
         report: receives the share that is done, in [0, 1]
     """
     report(0)
-    scene = results.scene(photo, recipe.sun, recipe.denoise)
+    scene = results.scene(photo, recipe.sun)
     view: View = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
     if recipe.camera is not None:
         camera, pose = results.camera(photo, recipe.camera)
@@ -288,7 +289,7 @@ def write_animation(
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    scene = resize_scene(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
+    scene = resize_scene(results.scene(photo, recipe.sun), recipe.width)
     pixels = []
     for k in range(recipe.frames):
         report(k / recipe.frames)
@@ -318,7 +319,7 @@ def write_relit(recipe: kinds.RelightRecipe, results: SolvedSet, photo: str, out
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    scene = resize_scene(results.scene(photo, denoise=recipe.denoise), recipe.width)
+    scene = resize_scene(results.scene(photo), recipe.width)
     lights = recipe.lights or [name for name in results.photos if name != photo]
     for k, name in enumerate(lights):
         report(k / len(lights))
@@ -358,11 +359,10 @@ def write_grid(recipe: kinds.GridRecipe, results: SolvedSet, out: Path, progress
         balls = []
         for j, material in enumerate(materials):
             progress(k * len(materials) + j, total, f"{material}, {name}")
-            balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples, recipe.denoise))
+            balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples))
         columns.append(TracedPicture(np.concatenate(balls)).with_exposure().pixels)
     _write_transparent(out / "grid", TracedPicture(np.concatenate(columns, axis=1)))
-    denoised = f"denoised: {denoiser()}\n" if recipe.denoise else ""
-    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n{denoised}")
+    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n")
     progress(total, total)
 
 

@@ -1,6 +1,7 @@
 """Radiance by the reflection operator: surface points in a light of many lobes, a photo again, and balls.
 
-Occlusion scales each lobe by the share that a point sees (`factorlib.light.visibility`).  A light of finite distance
+Occlusion scales each lobe by the share that a point sees (`factorlib.light.visibility`), for the diffuse part each
+channel of all lobes, whose share is a mean of theirs.  A light of finite distance
 changes angles and weights for points away from the middle (`factorlib.light.distance`).  Both are as in the solve.
 
 A photo is rendered on the normals and views of its aligned meshes.  A ball is seen from the front, orthographically: it
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,8 +30,8 @@ from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
 from factorlib.images.exr import read_exr
 from factorlib.inference.interreflection import bounced_light
 from factorlib.light.distance import finite_distance_cosines
-from factorlib.light.lobes import Lobes
-from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
+from factorlib.light.lobes import Lobes, lobe_energy
+from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share, widened_sharpness
 from factorlib.reflection import Operator
 from factorlib.results.materials import Model, Reflectance
 from factorlib.urm.extract import with_surface_normals
@@ -54,6 +56,14 @@ class PointEffects(msgspec.Struct, frozen=True):
 
     visibility: UInt8[np.ndarray, "n k"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
+
+
+class SampledLight(NamedTuple):
+    """Light at k directions: widened lobes of weight one, and radiance of each channel over its largest value."""
+
+    directions: Float[Tensor, "k 3"]
+    lobes: Float[Tensor, "k p"]
+    light: Float[Tensor, "k 3"]
 
 
 class Reflector:
@@ -102,14 +112,26 @@ class Reflector:
         result = np.zeros((2, len(normals), 3))
         step = max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
         optional = msgspec.structs.astuple(effects)
+        sampled = None if effects.visibility is None else self._sampled(effects.visibility.shape[1])
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
                 tensors = (None if values is None else self._tensor(values[rows]) for values in optional)
-                radiance = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), *tensors)
+                radiance = self._radiance(
+                    material, self._tensor(normals[rows]), self._tensor(views[rows]), *tensors, sampled
+                )
                 result[:, rows] = radiance.double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
+
+    def _sampled(self, count: int) -> SampledLight:
+        """Return the light at `count` directions; widened lobes keep their energy."""
+        directions = torch.from_numpy(fibonacci_sphere(count)).float()
+        lobes = kernel(directions, self.axis.float(), self.sharpness.float())
+        wide = widened_sharpness(self.sharpness.double(), count).numpy()
+        factor = lobe_energy(self.lobes.sharpness) / lobe_energy(wide)
+        light = lobes @ torch.from_numpy(self.lobes.weight * factor[:, None]).float()
+        return SampledLight(directions, lobes, light / light.amax(0).clamp_min(1e-30))
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(np.require(values, requirements=["C", "W"]), dtype=self.operator.dtype)
@@ -121,6 +143,7 @@ class Reflector:
         views: Float[Tensor, "n 3"],
         visibility: Float[Tensor, "n k"] | None,
         place: Float[Tensor, "n 3"] | None,
+        sampled: SampledLight | None,
     ) -> Float[Tensor, "2 n 3"]:
         parts = material.diffuse, material.specular, material.roughness
         kd, ks, roughness = (torch.tensor(part, dtype=self.operator.dtype) for part in parts)
@@ -128,23 +151,20 @@ class Reflector:
         no = (normals * views).sum(-1)
         nz = (normals @ self.axis.T).clamp(-1, 1)
         oz = (views @ self.axis.T).clamp(-1, 1)
-        shares: list[float | Tensor] = [1.0, 1.0]
-        if visibility is not None:
-            directions = torch.from_numpy(fibonacci_sphere(visibility.shape[1])).float()
-            lobes = kernel(directions, self.axis.float(), self.sharpness.float())
-            glossy = highlight_weights(normals.float(), views.float(), directions, float(roughness))
-            weights = cosine_weights(normals.float(), directions), glossy
-            visible = visibility.float() / 255
-            shares = [visible_share(visible, weight, lobes).to(self.operator.dtype) for weight in weights]
+        larger: float | Tensor = 1.0
         if place is not None and self.curvature > 0:
             nz, oz, larger = finite_distance_cosines(place, normals, views, self.axis, self.curvature)
-            shares = [larger * share for share in shares]
-        # diffuse and specular part, summed over lobes
-        diffuse = kd * ((shares[0] * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
+        # diffuse and specular part, summed over lobes; the shadow of the diffuse one is a share of each channel
+        diffuse = kd * ((larger * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
         specular = torch.zeros_like(diffuse)
+        if visibility is not None:
+            visible = visibility.float() / 255
+            diffuse *= visible_share(visible, cosine_weights(normals.float(), sampled.directions), sampled.light)
         if bool(ks.any()):
-            responses = self.operator.specular(roughness, self.sharpness, no, nz, oz)
-            specular = ks * ((shares[1] * responses) @ self.weight)
+            if visibility is not None:
+                weights = highlight_weights(normals.float(), views.float(), sampled.directions, float(roughness))
+                larger = larger * visible_share(visible, weights, sampled.lobes).to(self.operator.dtype)
+            specular = ks * ((larger * self.operator.specular(roughness, self.sharpness, no, nz, oz)) @ self.weight)
         return torch.stack([diffuse, specular]) * (no[:, None] > 0)
 
 

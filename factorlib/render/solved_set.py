@@ -70,13 +70,12 @@ class SolvedSet:
         self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, *moved, textures)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
-    def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:
+    def scene(self, photo: str, sun: AssumedSun | None = None) -> PhotoScene:
         """Return the photo's objects in their poses and in its light.
 
         Args:
             photo: name of the photo
             sun: an assumed sun, which replaces the light's own suns
-            denoise: see `PhotoScene`
 
         Raises:
             InputError: The photo has no objects.
@@ -104,7 +103,7 @@ class SolvedSet:
         if sun is not None:
             assert isinstance(light, Lobes)  # a photo's, and no map of a file
             light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
-        return PhotoScene(camera, placed, light, self.materials, depth, denoise)
+        return PhotoScene(camera, placed, light, self.materials, depth)
 
     def camera(self, photo: str, view: ViewCamera) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
         """Return the camera of a view of a photo's objects, and its pose in the world of the photo's scene.

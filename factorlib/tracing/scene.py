@@ -8,22 +8,19 @@ Envmap   Mitsuba puts row i of a map at i/(H−1) of the way down, and column j 
          Interpolation convolves a lobe with a triangle of the node spacing h, of variance h²/6 along each axis.  A lobe
          of sharpness λ has variance 1/λ.  Lobes are first sharpened by that amount at the same energy, so that the
          interpolated map has their energy and width.
-Noise    Intel Open Image Denoise, if mitsuba-oidn is installed (the extra `denoise`).  Its input is linear radiance
-         and, as guides, the albedo and normal of each pixel, which have hardly any noise.  Before denoising, a partly
-         covered pixel gets its foreground colour in full, and pixels without coverage get that of the nearest covered
-         one, so that no contour is blurred.
+Noise    Intel Open Image Denoise (mitsuba-oidn).  Its input is linear radiance and, as guides, the albedo and normal of
+         each pixel, which have hardly any noise.  Before denoising, a partly covered pixel gets its foreground colour
+         in full, and pixels without coverage get that of the nearest covered one, so that no contour is blurred.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
@@ -157,21 +154,7 @@ def sensor(
     }
 
 
-class Channels(msgspec.Struct, frozen=True):
-    """Choice of the further contents of a rendering: the light itself, and guides of a denoiser.
-
-    Attributes:
-        hide_emitters: hide the light itself, where alpha is then 0
-        guides: add six channels, albedo and normal, which guide a denoiser
-    """
-
-    hide_emitters: bool = False
-    guides: bool = False
-
-
-def render_scene(
-    entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, channels: Channels = Channels()
-) -> Image:
+def render_scene(entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, guides: bool = False) -> Image:
     """Render the radiance of a scene in the picture of a `sensor`.
 
     Many samples are rendered in several passes of stratified samples, so that no pass needs much memory.
@@ -182,7 +165,7 @@ def render_scene(
         spp: Least number of samples per pixel.
         seed: Seed.
         max_depth: 2 for direct light alone, −1 for all bounces.
-        channels: Choice of the light and the channels.
+        guides: Hide the light itself, where alpha is then 0, and add albedo and normal, which guide the denoiser.
 
     Returns:
         Radiance and further channels.
@@ -190,8 +173,8 @@ def render_scene(
     mi = mitsuba()
     # load objects one by one: the lights of a nested dictionary come in a random order, which changes the noise
     loaded = {n: mi.load_dict(e, parallel=False) if isinstance(e, dict) else e for n, e in entries.items()}
-    integrator: Entry = {"type": "path", "max_depth": max_depth, "hide_emitters": channels.hide_emitters}
-    if channels.guides:
+    integrator: Entry = {"type": "path", "max_depth": max_depth, "hide_emitters": guides}
+    if guides:
         integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "picture": integrator}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
     passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
@@ -295,11 +278,6 @@ def denoise_picture(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "
     radiance, _, albedo, normal = map(np.ascontiguousarray, np.split(whole, [3, 4, 7], axis=-1))
     clean = mitsuba_oidn.denoise(radiance, albedo.clip(0, 1), normal, hdr=True, clean_aux=True)
     return np.concatenate([clean.clip(0) * coverage, coverage], axis=-1)
-
-
-def denoiser() -> str:
-    """Return name and version of the denoiser."""
-    return f"mitsuba-oidn {version('mitsuba-oidn')}"
 
 
 NARROWEST = 0.5  # least variance, in h², of a lobe at the nodes: a narrower one would fall between them
