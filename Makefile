@@ -110,7 +110,6 @@ help-all:
 	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX, OpenUSD'
 	@echo '     EXTRAS=masks                     and the network of automatic masks (docs/photos.md)'
 	@echo '     EXTRAS=video                     and PyAV: animations as MP4, too (docs/recipes.md)'
-	@echo '     EXTRAS=denoise                   and Intel Open Image Denoise: `denoise: true` in recipes (docs/recipes.md)'
 	@echo '     EXTRAS=dask                      and Dask: SET="executor=tcp://…" runs steps on a cluster (docs/distributed.md)'
 
 .DEFAULT:

@@ -29,7 +29,6 @@ EXTRAS = {  # of modules that import what an extra alone installs
     for module, extra in (
         ("runner/worker", "dask"),
         ("images/film", "video"),
-        ("tracing/scene", "denoise"),
         ("onboarding/matte", "masks"),
     )
 }

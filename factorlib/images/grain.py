@@ -23,7 +23,7 @@ def grain_covariance(photo: Picture) -> Float[np.ndarray, "3 3"]:
     height, width = photo.shape[0] // 2 * 2, photo.shape[1] // 2 * 2
     encoded = srgb_encode(photo[:height, :width])
     corners = np.stack([encoded[i::2, j::2] for i in (0, 1) for j in (0, 1)])
-    usable = ((corners > DARKEST) & (corners < BRIGHTEST * encoded.max())).all(axis=(0, 3))
+    usable = ((corners > DARKEST) & (corners < BRIGHTEST * encoded.max(initial=0))).all(axis=(0, 3))
     detail = np.einsum("k,khwc->hwc", [0.5, -0.5, -0.5, 0.5], corners)[usable]
     if len(detail) == 0:
         return np.zeros((3, 3))

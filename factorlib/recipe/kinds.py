@@ -39,7 +39,7 @@ CURE = (
 class BaseRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
     """Fields that every kind of recipe has."""
 
-    samples: Samples = 256
+    samples: Samples = 32
     """Samples per pixel of the path tracer; the noise falls with their square root."""
 
 

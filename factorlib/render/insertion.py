@@ -31,7 +31,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_erosion, distance_transform_edt, uniform_filter
+from scipy.ndimage import binary_erosion, distance_transform_edt, median_filter
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
@@ -43,12 +43,12 @@ from factorlib.render.ground import disk, height_over, smooth_step
 from factorlib.render.photo_scene import CAMERA_POSE, PhotoScene, PlacedMesh, light_entries, shapes, visible_window
 from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3
-from factorlib.tracing.scene import denoise_picture, render_scene, rgb, sensor
+from factorlib.tracing.scene import GUIDE_SAMPLES, denoise_picture, render_guides, render_scene, rgb, sensor
 
 FADE = 0.5  # outer share of the disc's radius in which shadows fade
 PREVIEW = 160  # columns of a preview, which tells the ground's colour and the reach of the new object
 PREVIEW_SAMPLES = 64
-LEAST_CHANGE = 0.005  # relative change of radiance that counts as reached: a quarter of a step of 8-bit sRGB
+LEAST_CHANGE = 0.01  # relative change of radiance that counts as reached: half a step of 8-bit sRGB
 GREY = 0.3  # default diffuse reflectance of the ground
 DARKEST = 0.02  # least diffuse reflectance of the ground
 BRIGHTEST = 0.85  # largest diffuse reflectance of the ground
@@ -120,13 +120,13 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
         return light_entries(scene.light, scene.size), shapes(scene.objects, scene.materials)
 
     @property
-    def fade(self) -> Float[np.ndarray, "h w"]:
+    def fade(self) -> Float[np.ndarray, "h w 1"]:
         """The weight of the shadow: 1 near the spot and above the horizon, and smoothly 0 at the rim of the disc."""
-        return smooth_step((1 - np.where(np.isinf(self.distance), 0, self.distance)) / (1 - FADE))
+        return smooth_step((1 - np.where(np.isinf(self.distance), 0, self.distance)) / (1 - FADE))[..., None]
 
     @property
-    def preview(self) -> tuple[Camera, tuple[slice, slice]]:
-        """A camera of about PREVIEW columns, and the rows and columns of the photo at the middles of its pixels."""
+    def preview_camera(self) -> tuple[Camera, tuple[slice, slice]]:
+        """The camera of previews, and the rows and columns of the photo at the middles of its pixels."""
         camera = self.scene.camera
         pixel = max(1, camera.width // PREVIEW)
         height = camera.height // pixel
@@ -140,19 +140,14 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
         centre = self.spot.point - HAIR * self.spot.height * normal
         return {GROUND: disk(centre, normal, RADIUS * self.spot.height, material)}
 
-    def sensor(self, camera: Camera) -> dict[str, Any]:
+    def view(self, camera: Camera) -> dict[str, Any]:
         """Return a camera at the photo's place, for Mitsuba."""
         return sensor(camera, CAMERA_POSE, near_clip=self.scene.near_clip, alpha=True)
 
     def render(
-        self,
-        entries: dict[str, Any],
-        camera: Camera,
-        samples: int = PREVIEW_SAMPLES,
-        seed: int = 1,
-        light: dict[str, Any] | None = None,
-    ) -> Float[np.ndarray, "h w 10"]:
-        """Render the photo's objects with further entries, as `denoise_picture` takes it.
+        self, entries: dict[str, Any], camera: Camera, samples: int, seed: int, light: dict[str, Any] | None = None
+    ) -> Float[np.ndarray, "h w 4"]:
+        """Render the photo's objects with further entries.
 
         Args:
             entries: Mitsuba objects by name
@@ -162,8 +157,12 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
             light: replaces the photo's light
         """
         photo_light, objects = self.entries
-        everything = (light or photo_light) | objects | entries
-        return render_scene(everything, self.sensor(camera), samples, seed, ALL_BOUNCES, guides=True)
+        scene = (light or photo_light) | objects | entries
+        return render_scene(scene, self.view(camera), samples, seed, ALL_BOUNCES, hide_emitters=True)
+
+    def preview(self, entries: dict[str, Any], seed: int = 1, light: dict[str, Any] | None = None) -> Picture:
+        """Render a preview of the photo's objects with further entries; arguments as for `render`."""
+        return self.render(entries, self.preview_camera[0], PREVIEW_SAMPLES, seed, light)[..., :3]
 
 
 class ShadowMatch(msgspec.Struct, frozen=True):
@@ -207,12 +206,14 @@ class InsertionResult(msgspec.Struct, frozen=True):
         coverage: α
         shadow: s of (1)
         ground: diffuse reflectance used for the ground
+        without: preview of L₀
     """
 
     composite: Picture
     coverage: Float[np.ndarray, "h w"]
     shadow: Picture
     ground: Float[np.ndarray, "3"]
+    without: Picture
 
 
 def insert_object(
@@ -239,37 +240,47 @@ def insert_object(
     new = shapes([insertion.new], insertion.scene.materials)
     shows_ground = (insertion.distance < 1) & ~covered
     diffuse = insertion.ground.diffuse or _ground_colour(insertion, photo, shows_ground, seed)
-    grounds = [insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))]
-    if insertion.ground.polish is not None:
-        grounds.append(insertion.disc(insertion.ground.polish))
     report(1)
-    window = _reach(insertion, grounds, new, seed)
+    polish = insertion.ground.polish
+    materials = [Reflectance(diffuse, (0.0,) * 3, 1.0), *([] if polish is None else [polish])]
+    pairs = [(disc, disc | new) for disc in map(insertion.disc, materials)]
+    previews = [[insertion.preview(entries, seed) for entries in pair] for pair in pairs]
+    window = _reach(insertion, previews)
     report(2)
     camera = insertion.scene.camera.crop(*window)
     coverage = _coverage(insertion, camera, samples, seed)
     background = (1 - coverage)[..., None]
-    fade = insertion.fade[window][..., None]
-    pairs = [[insertion.render(e, camera, samples, seed) for e in (ground, ground | new)] for ground in grounds]
+    fade = insertion.fade[window]
+    guides = [
+        render_guides(insertion.entries[1] | entries, insertion.view(camera), GUIDE_SAMPLES, seed)
+        for entries in pairs[0]
+    ]
+    renderings = [[insertion.render(entries, camera, samples, seed) for entries in pair] for pair in pairs]
     report(3)
     # (2)
-    shadow = _shadow(*pairs[0], coverage, fade)
-    gain = denoise_picture(pairs[0][1])[..., :3] - background * shadow * pairs[0][0][..., :3]
-    changed = background * shadow * photo[window] + np.maximum(gain, 0) * (background < 1)
+    without, with_object = renderings[0]
+    shadow = _shadow(without, with_object, guides[0], coverage, fade)
+    gain = denoise_picture(with_object, guides[1])[..., :3] - background * shadow * without[..., :3]
+    part = background * shadow * photo[window] + np.maximum(gain, 0) * (background < 1)
     # change of the ground's specular part: the object's reflection in it
-    for without, with_object in pairs[1:]:
-        mirrored = (denoise_picture(with_object) - denoise_picture(without))[..., :3]
-        mirrored *= (with_object != without)[..., :3] * shows_ground[window][..., None]
-        changed = np.maximum(changed + mirrored * background * fade, 0)
-    result = InsertionResult(photo.copy(), np.zeros(covered.shape), np.ones_like(photo), np.asarray(diffuse))
-    for whole, part in ((result.composite, changed), (result.coverage, coverage), (result.shadow, shadow)):
-        whole[window] = part
+    for pair in renderings[1:]:
+        clean = [denoise_picture(*each)[..., :3] for each in zip(pair, guides)]
+        mirrored = (clean[1] - clean[0]) * (pair[1] != pair[0])[..., :3] * shows_ground[window][..., None]
+        part = np.maximum(part + mirrored * background * fade, 0)
+    result = InsertionResult(
+        photo.copy(), np.zeros(covered.shape), np.ones_like(photo), np.asarray(diffuse), previews[0][0]
+    )
+    result.composite[window] = part
+    result.coverage[window] = coverage
+    result.shadow[window] = shadow
     report(STEPS)
     return result
 
 
 def _shadow(
-    without: Float[np.ndarray, "h w 10"],
-    with_object: Float[np.ndarray, "h w 10"],
+    without: Float[np.ndarray, "h w 4"],
+    with_object: Float[np.ndarray, "h w 4"],
+    guides: Float[np.ndarray, "h w 10"],
     coverage: Float[np.ndarray, "h w"],
     fade: Float[np.ndarray, "h w 1"],
 ) -> Picture:
@@ -281,18 +292,18 @@ def _shadow(
     Args:
         without: rendering of the scene without the object
         with_object: rendering with it
+        guides: guides of the denoiser, without it
         coverage: α
         fade: weight of the shadow
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shadow = np.where(without[..., :3] > 0, with_object[..., :3] / without[..., :3], 1.0)
+    lit = without[..., :3]
+    shadow = np.divide(with_object[..., :3], lit, out=np.ones_like(lit), where=lit > 0)
     uncovered = coverage == 0
     if uncovered.any():
         row, column = distance_transform_edt(~uncovered, return_distances=False, return_indices=True)
         shadow = shadow[row, column]
     shadow = 1 + (shadow - 1) * fade
-    clean = denoise_picture(np.concatenate([shadow, np.ones_like(fade), without[..., 4:]], axis=-1))[..., :3]
-    return np.where(shadow == 1, 1, clean)
+    return np.where(shadow == 1, 1, denoise_picture(np.concatenate([shadow, np.ones_like(fade)], -1), guides)[..., :3])
 
 
 def compare_shadow(
@@ -314,63 +325,53 @@ def compare_shadow(
     ]
     shows_ground = binary_erosion((insertion.distance < 1) & ~covered & np.any(near, axis=0), iterations=RIM)
     disc = insertion.disc(Reflectance(vec3(result.ground), (0.0,) * 3, 1.0))
-    sky = {"light": {"type": "constant", "radiance": rgb(1.0)}}
-    camera, middles = insertion.preview
-    lit, constant = (insertion.render(disc, camera, light=light)[..., :3] for light in (None, sky))
-    return shadow_match(photo[middles], lit, constant, shows_ground[middles])
+    constant = insertion.preview(disc, light={"light": {"type": "constant", "radiance": rgb(1.0)}})
+    _, middles = insertion.preview_camera
+    return shadow_match(photo[middles], result.without, constant, shows_ground[middles])
 
 
 def _ground_colour(
     insertion: InsertionScene, photo: Picture, shows_ground: Bool[np.ndarray, "h w"], seed: int
 ) -> tuple[float, float, float]:
     """Return the diffuse reflectance at which the ground matches the photo: the median over its pixels."""
-    camera, middles = insertion.preview
-    grey = insertion.disc(Reflectance((GREY,) * 3, (0.0,) * 3, 1.0))
-    lit = insertion.render(grey, camera, seed=seed)[..., :3]
+    lit = insertion.preview(insertion.disc(Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), seed)
+    _, middles = insertion.preview_camera
     usable = shows_ground[middles] & (lit.min(axis=-1) > 0)
     if not usable.any():
         return (GREY,) * 3
     return vec3(np.clip(GREY * np.median(photo[middles][usable] / lit[usable], axis=0), DARKEST, BRIGHTEST))
 
 
-def _reach(
-    insertion: InsertionScene, grounds: Sequence[dict[str, Any]], new: dict[str, Any], seed: int
-) -> tuple[slice, slice]:
+def _reach(insertion: InsertionScene, previews: Sequence[Sequence[Picture]]) -> tuple[slice, slice]:
     """Return the rows and columns of the pixels that the new object, its shadow or its reflection can reach.
 
-    A preview without and with the object tells the pixels that change by more than LEAST_CHANGE.
+    These are the object itself, and pixels of a preview most of whose neighbours change by more than LEAST_CHANGE.
 
     Args:
         insertion: the scene and the new object's place
-        grounds: Mitsuba's entries of the ground, diffuse and polished
-        new: Mitsuba's entries of the new object
-        seed: seed of the random numbers
+        previews: pairs of previews without and with the object
     """
-    camera, middles = insertion.preview
-    changed = np.zeros((camera.height, camera.width), bool)
+    camera, middles = insertion.preview_camera
+    fade = insertion.fade[middles]
+    changes = [(np.abs(second - first) * fade > LEAST_CHANGE * first).any(axis=-1) for first, second in previews]
+    changed = median_filter(np.any(changes, axis=0), 3)
     changed[visible_window(insertion.new.vertices, camera, CAMERA_POSE)] = True
-    for ground in grounds:
-        without, with_object = (insertion.render(e, camera, seed=seed)[..., :3] for e in (ground, ground | new))
-        change = np.abs(with_object - without) * insertion.fade[middles][..., None]
-        # means of 3 × 3 pixels
-        change, level = (uniform_filter(each, (3, 3, 1)) for each in (change, without))
-        changed |= (change > LEAST_CHANGE * level).any(axis=-1)
-    pixel = middles[0].step
     spans = [np.flatnonzero(changed.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0)]
-    rows, columns = (slice(max(0, pixel * (low - 1)), pixel * (high + 2)) for low, high in spans)
-    return slice(rows.start, min(rows.stop, len(insertion.distance))), slice(
-        columns.start, min(columns.stop, insertion.distance.shape[1])
+    pixel = middles[0].step
+    rows, columns = (
+        slice(max(0, pixel * (low - 1)), min(size, pixel * (high + 2)))
+        for (low, high), size in zip(spans, insertion.distance.shape)
     )
+    return rows, columns
 
 
 def _coverage(insertion: InsertionScene, camera: Camera, samples: int, seed: int) -> Float[np.ndarray, "h w"]:
     """Render the albedo of the new object in white and all else in black, which is the object's share of each pixel."""
-    new = msgspec.structs.replace(insertion.new, mesh=without_paint(insertion.new.mesh, insertion.new.mesh.labels))
-    materials = insertion.scene.materials
-    entries = shapes(insertion.scene.objects, dict.fromkeys(materials, BLACK)) | shapes(
-        [new], dict.fromkeys(materials, WHITE)
-    )
-    coverage = np.clip(render_scene(entries, insertion.sensor(camera), samples, seed, 1, guides=True)[..., 4], 0, 1)
+    mesh = insertion.new.mesh
+    white = msgspec.structs.replace(insertion.new, mesh=without_paint(mesh, mesh.labels))
+    black, bright = (dict.fromkeys(insertion.scene.materials, each) for each in (BLACK, WHITE))
+    entries = shapes(insertion.scene.objects, black) | shapes([white], bright)
+    coverage = render_guides(entries, insertion.view(camera), samples, seed)[..., 4].clip(0, 1)
     if not coverage.any():
         raise InputError(
             "the new object is invisible: it stands outside the picture, or other objects hide it",

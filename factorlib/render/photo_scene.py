@@ -29,11 +29,11 @@ from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import (
     NARROWEST,
     bsdf,
-    denoise_picture,
     envmap,
     envmap_of_nodes,
     mitsuba_map,
     paint,
+    render_denoised,
     render_scene,
     rgb,
     rigid,
@@ -44,7 +44,7 @@ from factorlib.tracing.scene import (
 UP = np.array([0.0, 1.0, 0.0])
 NEAR = 1e-3  # near clipping distance, in distances of the objects
 FAR = 3e3  # distance of suns, in sizes of the scene
-LOBE_ROWS = 256  # rows of Mitsuba's map of lobes
+LOBE_ROWS = 128  # rows of Mitsuba's map of lobes
 MAP_ROWS = 1024  # rows of Mitsuba's map of a lat-long map
 
 LIGHT_SAMPLES = 16  # samples per pixel of the light behind objects, which is smooth
@@ -195,7 +195,7 @@ def traced_photo(
         window = slice(0, scene.camera.height), slice(0, scene.camera.width)
     view = sensor(scene.camera.crop(*window), world_from_camera, near_clip=scene.near_clip, alpha=True)
     picture = np.zeros((scene.camera.height, scene.camera.width, 4))
-    picture[window] = denoise_picture(render_scene(entries, view, samples, 0, scene.max_depth, guides=True))
+    picture[window] = render_denoised(entries, view, samples, 0, scene.max_depth)
     return picture
 
 
@@ -227,9 +227,7 @@ def lit_ball(light: DistantLight, material: Reflectance, size: int, samples: int
     camera = Camera(size, size, focal, (size / 2, size / 2))
     sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
     entries = {**light_entries(light, distance), "ball": sphere}
-    return denoise_picture(
-        render_scene(entries, sensor(camera, CAMERA_POSE, alpha=True), samples, 0, DIRECT, guides=True)
-    )
+    return render_denoised(entries, sensor(camera, CAMERA_POSE, alpha=True), samples, 0, DIRECT)
 
 
 def resize_scene(scene: PhotoScene, width: int | None) -> PhotoScene:

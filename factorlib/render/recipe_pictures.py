@@ -206,8 +206,8 @@ def write_insertion(
         log.warning("%s: do not trust the shadow: %s", photo, CONTRADICTED)
     # Pixels that the new object does not change keep the photo's values exactly.
     original = results.photo(photo)
-    picture = np.where(result.composite == linear, original, results.tone(photo)(result.composite))
-    _write_opaque(out / photo, add_grain(picture, original, result.coverage))
+    edited = np.where(result.composite == linear, original, results.tone(photo)(result.composite))
+    _write_opaque(out / photo, add_grain(edited, original, result.coverage))
     pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
     source = "that of dataset.yaml"
     if results.grounds[photo].ground is None:

@@ -36,6 +36,7 @@ from factorlib.tracing.variant import mitsuba
 
 SAMPLER = "multijitter"
 SAMPLES_PER_PASS = 1 << 23
+GUIDE_SAMPLES = 8  # samples per pixel of the denoiser's guides
 ENVMAP_FINER = 8  # rows of Mitsuba's lattice per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
 Entry = dict[str, Any]
@@ -154,10 +155,10 @@ def sensor(
     }
 
 
-def render_scene(entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, guides: bool = False) -> Image:
+def render_scene(
+    entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False
+) -> Image:
     """Render the radiance of a scene in the picture of a `sensor`.
-
-    Many samples are rendered in several passes of stratified samples, so that no pass needs much memory.
 
     Args:
         entries: Mitsuba objects by name.
@@ -165,21 +166,38 @@ def render_scene(entries: Entry, view: Entry, spp: int, seed: int, max_depth: in
         spp: Least number of samples per pixel.
         seed: Seed.
         max_depth: 2 for direct light alone, −1 for all bounces.
-        guides: Hide the light itself, where alpha is then 0, and add albedo and normal, which guide the denoiser.
+        hide_emitters: Hide the light itself, where alpha is then 0.
 
     Returns:
-        Radiance and further channels.
+        Radiance and, if the sensor has it, alpha.
     """
+    return _render(entries, view, spp, seed, {"type": "path", "max_depth": max_depth, "hide_emitters": hide_emitters})
+
+
+def render_guides(entries: Entry, view: Entry, spp: int, seed: int) -> Image:
+    """Render alpha (channel 3), albedo (4 to 6) and normal (7 to 9), which guide the denoiser; arguments as above.
+
+    A rendering with these channels takes twice as long as one without, and they need few samples.
+    """
+    path = {"type": "path", "max_depth": 1, "hide_emitters": True}
+    return _render(entries, view, spp, seed, {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "picture": path})
+
+
+def _render(entries: Entry, view: Entry, spp: int, seed: int, integrator: Entry) -> Image:
+    """Render many samples in several passes of stratified samples, so that no pass needs much memory."""
     mi = mitsuba()
     # load objects one by one: the lights of a nested dictionary come in a random order, which changes the noise
     loaded = {n: mi.load_dict(e, parallel=False) if isinstance(e, dict) else e for n, e in entries.items()}
-    integrator: Entry = {"type": "path", "max_depth": max_depth, "hide_emitters": guides}
-    if guides:
-        integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "picture": integrator}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
     passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
     images = [mi.render(scene, seed=passes * seed + k, spp=-(-spp // passes)) for k in range(passes)]
     return np.mean([np.array(image, dtype=np.float64) for image in images], axis=0)
+
+
+def render_denoised(entries: Entry, view: Entry, spp: int, seed: int, max_depth: int) -> Image:
+    """Render objects without the light behind them, and denoise; arguments as for `render_scene`."""
+    picture = render_scene(entries, view, spp, seed, max_depth, hide_emitters=True)
+    return denoise_picture(picture, render_guides(entries, view, min(spp, GUIDE_SAMPLES), seed))
 
 
 def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> dict[str, Any]:
@@ -261,23 +279,33 @@ def cube_map_lookup(faces: dict[str, np.ndarray], directions: Float[np.ndarray, 
     return values
 
 
-def denoise_picture(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]:
+def denoise_picture(
+    picture: Float[np.ndarray, "h w 4"], guides: Float[np.ndarray, "h w 10"]
+) -> Float[np.ndarray, "h w 4"]:
     """Denoise linear radiance times coverage; coverage is left unchanged.
 
-    `picture` holds radiance, coverage, and the guides of `factorlib.tracing.scene.render_scene`, all times coverage.
+    Args:
+        picture: radiance and coverage
+        guides: result of `render_guides`
     """
     os.environ["OIDN_DEFAULT_DEVICE"] = "cpu"  # the same bytes with and without a GPU
     mitsuba()  # the denoiser uses its thread pool
     import mitsuba_oidn
 
+    coverage = picture[..., 3:]
+    if not (coverage.any() and guides[..., 3].any()):
+        return picture
+    radiance, _ = np.split(_foreground(picture), [3], axis=-1)
+    _, albedo, normal = np.split(_foreground(guides), [4, 7], axis=-1)
+    aids = map(np.ascontiguousarray, (radiance, albedo.clip(0, 1), normal))
+    return np.concatenate([mitsuba_oidn.denoise(*aids, hdr=True, clean_aux=True).clip(0) * coverage, coverage], axis=-1)
+
+
+def _foreground(picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    """Divide by the coverage, channel 3; pixels without coverage get the values of the nearest covered one."""
     coverage = picture[..., 3:4]
-    if not coverage.any():
-        return picture[..., :4]
     row, column = distance_transform_edt(coverage[..., 0] <= 0, return_distances=False, return_indices=True)
-    whole = (picture / np.where(coverage > 0, coverage, 1))[row, column].astype(np.float32)
-    radiance, _, albedo, normal = map(np.ascontiguousarray, np.split(whole, [3, 4, 7], axis=-1))
-    clean = mitsuba_oidn.denoise(radiance, albedo.clip(0, 1), normal, hdr=True, clean_aux=True)
-    return np.concatenate([clean.clip(0) * coverage, coverage], axis=-1)
+    return (picture / np.where(coverage > 0, coverage, 1))[row, column].astype(np.float32)
 
 
 NARROWEST = 0.5  # least variance, in h², of a lobe at the nodes: a narrower one would fall between them

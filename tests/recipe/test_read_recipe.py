@@ -87,10 +87,3 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
     recipe = read_recipe(path, dataset)
     assert isinstance(recipe, InsertRecipe) and recipe.material == "gold"
     assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}
-
-
-def test_a_denoiser_that_is_not_installed_is_refused_with_the_cure(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("factorlib.recipe.read_recipe.find_spec", lambda name: None)
-    error = refusal(r"denoise.*not installed", read_recipe, written(tmp_path, "kind: view\ndenoise: true"), dataset)
-    assert "make setup EXTRAS=denoise" in str(error)
-    assert not read_recipe(written(tmp_path, "kind: view\ndenoise: false"), dataset).denoise

@@ -16,14 +16,17 @@ from factorlib.render.ground import ground_below, on_floor
 from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compare_shadow, insert_object, shadow_match
 from factorlib.render.photo_scene import (
     ALL_BOUNCES,
+    CAMERA_POSE,
     Orbit,
     PhotoScene,
     PlacedMesh,
+    before_light,
     light_entries,
     lit_ball,
     rotate_light,
     shapes,
     traced_photo,
+    visible_window,
     with_sun,
 )
 from factorlib.render.placement import STEP, Spot, free_placement, spot_beside, standing_mesh, unproject_spot
@@ -292,6 +295,44 @@ def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_ob
     rows, columns = np.nonzero(result.coverage > 0)
     below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
     assert below.max() > 0.05 and difference[0].max() == 0
+
+
+def test_every_pixel_that_the_object_changes_is_within_its_reach_and_all_others_are_the_photo():
+    """Against both scenes traced as a whole, whose difference is free of noise where no path meets the object."""
+    photo = np.random.default_rng(0).uniform(0.1, 0.9, (CAMERA.height, CAMERA.width, 3))
+    spot = msgspec.structs.replace(SPOT, height=0.4)
+    small = standing_mesh("new", sphere(1.0), ("red",), np.array([0, 1.0, 0]), 0.0, spot)
+    insertion = msgspec.structs.replace(stands(SCENE, small), spot=spot)
+    result = insert_object(insertion, photo, OPEN, 64)
+    ground = insertion.disc(Reflectance(tuple(result.ground), (0.0,) * 3, 1.0))
+    new_shapes = shapes([small], MATERIALS)
+    without, whole = (insertion.render(e, CAMERA, 1024, 1)[..., :3] for e in (ground, ground | new_shapes))
+    changed = np.abs(whole - without).max(axis=-1) * insertion.fade[..., 0] > 0.03 * np.maximum(
+        without.max(axis=-1), 0.01
+    )
+    same = (result.composite == photo).all(axis=-1)
+    assert not (changed & same).any() and changed.sum() > 30
+    assert same.mean() > 0.5 and (result.shadow[same] == 1).all() and not result.coverage[same].any()
+
+
+def test_only_the_window_of_the_objects_is_traced_and_it_shows_all_of_them(pair, monkeypatch):
+    part = traced_photo(pair, 256)
+    monkeypatch.setattr("factorlib.render.photo_scene.visible_window", lambda *_: (slice(0, 40), slice(0, 48)))
+    whole = traced_photo(pair, 256)
+    np.testing.assert_allclose(part[..., 3], whole[..., 3], atol=0.05)
+    assert differ(part, whole) < 0.02
+    away = msgspec.structs.replace(pair, objects=(placed("left", box(1, 1, 1), (-90, 0, -6)),))
+    assert not traced_photo(away, 1).any()
+    behind = np.array([[0.0, 0, -5], [0, 0, 5]])
+    assert visible_window(behind, SMALL, CAMERA_POSE) == (slice(0, 40), slice(0, 48))
+
+
+def test_behind_objects_stands_the_light_of_each_pixels_direction(pair):
+    picture = before_light(traced_photo(pair, 16), pair, CAMERA_POSE)
+    away = SMALL.rays() / np.linalg.norm(SMALL.rays(), axis=-1, keepdims=True)
+    sky = traced_photo(pair, 16)[..., 3] == 0
+    assert (picture[..., 3] == 1).all() and sky.any()
+    np.testing.assert_allclose(picture[sky][:, :3], pair.light.radiance(away[sky]), rtol=0.02)
 
 
 @pytest.mark.parametrize("turn", [0, 180])

@@ -281,6 +281,19 @@ def test_shadows_that_hide_nothing_change_nothing_and_those_that_hide_all_leave_
         np.testing.assert_allclose(result, factor * reflector(GLOSSY, normals, views), rtol=1e-5, atol=2e-3)
 
 
+@pytest.mark.parametrize("lobes", [light(), cells(), cells(20000.0)], ids=["few", "many", "suns"])
+def test_the_shadow_of_the_diffuse_part_is_as_if_each_lobe_had_its_own(lobes):
+    """Half of the directions are hidden, on one side of a plane through the point."""
+    operator, matt = reflection_operator("closed_form"), Reflectance((0.4, 0.2, 0.1), (0.0,) * 3, 1.0)
+    (normals, views), sphere = points(60), fibonacci_sphere(256)
+    seen = np.where(sphere @ unit(60, 9).T > 0, 255, 0).T.astype(np.uint8)
+    together = Reflector(operator, lobes)(matt, normals, views, effects=PointEffects(visibility=seen))
+    ones = [Reflector(operator, lobes.take(np.arange(len(lobes)) == k)) for k in range(len(lobes))]
+    each = sum(one(matt, normals, views, effects=PointEffects(visibility=seen)) for one in ones)
+    full = Reflector(operator, lobes)(matt, normals, views)
+    assert np.abs(together - each).max() < 0.02 * full.max() and (each < 0.7 * full).any()
+
+
 def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():
     operator, lobes, (normals, views) = reflection_operator("closed_form", dtype="float64"), light(), points(20)
     place, curvature = 1.5 * unit(20, 5), 0.2
