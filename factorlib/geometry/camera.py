@@ -42,10 +42,6 @@ class Camera(msgspec.Struct, frozen=True):
         centre = ((self.centre[0] - left) / pixel, (self.centre[1] - top) / pixel)
         return Camera(width, height, self.focal / pixel, centre)
 
-    def crop(self, rows: slice, columns: slice) -> "Camera":
-        """Return the camera of some rows and columns of the image."""
-        return self.window(columns.start, rows.start, 1.0, columns.stop - columns.start, rows.stop - rows.start)
-
     def rays(self, rows: slice = slice(None), columns: slice = slice(None)) -> Float[np.ndarray, "h w 3"]:
         """Return the directions through the pixel centres of some rows and columns, z = 1, camera frame."""
         x, y = np.meshgrid(np.arange(self.width)[columns] + 0.5, np.arange(self.height)[rows] + 0.5)

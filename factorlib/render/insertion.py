@@ -24,7 +24,7 @@ The ground is a disc about the object.  Its diffuse reflectance is the one at wh
 out toward the rim of the disc, beyond which the geometry of the scene is unknown.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -40,7 +40,15 @@ from factorlib.geometry.camera import Camera
 from factorlib.geometry.ground import Plane
 from factorlib.meshes.mesh import without_paint
 from factorlib.render.ground import disk, height_over, smooth_step
-from factorlib.render.photo_scene import CAMERA_POSE, PhotoScene, PlacedMesh, light_entries, shapes, visible_window
+from factorlib.render.photo_scene import (
+    CAMERA_POSE,
+    PhotoScene,
+    PlacedMesh,
+    crop_camera,
+    light_entries,
+    shapes,
+    visible_window,
+)
 from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3
 from factorlib.tracing.scene import GUIDE_SAMPLES, denoise_picture, render_guides, render_scene, rgb, sensor
@@ -63,7 +71,6 @@ BELIEVED = 0.3
 GROUND = "+ground"
 BLACK = Reflectance((0.0,) * 3, (0.0,) * 3, 1.0)
 WHITE = Reflectance((1.0,) * 3, (0.0,) * 3, 1.0)
-STEPS = 4
 NEW = "+"  # prefix of the new object and its materials: no name in dataset.yaml has it
 
 Picture = Float[np.ndarray, "h w 3"]
@@ -221,7 +228,6 @@ def insert_object(
     photo: Picture,
     covered: Bool[np.ndarray, "h w"],
     samples: int,
-    report: Callable[[int], None] = lambda done: None,
     seed: int = 1,
 ) -> InsertionResult:
     """Return the photo with the new object.
@@ -231,7 +237,6 @@ def insert_object(
         photo: linear radiance, with the tone curve undone
         covered: pixels that show something other than the ground
         samples: samples per pixel
-        report: receives the number of steps done, of STEPS
         seed: seed of the random numbers, which all renderings share
 
     Raises:
@@ -240,14 +245,12 @@ def insert_object(
     new = shapes([insertion.new], insertion.scene.materials)
     shows_ground = (insertion.distance < 1) & ~covered
     diffuse = insertion.ground.diffuse or _ground_colour(insertion, photo, shows_ground, seed)
-    report(1)
     polish = insertion.ground.polish
     materials = [Reflectance(diffuse, (0.0,) * 3, 1.0), *([] if polish is None else [polish])]
     pairs = [(disc, disc | new) for disc in map(insertion.disc, materials)]
     previews = [[insertion.preview(entries, seed) for entries in pair] for pair in pairs]
     window = _reach(insertion, previews)
-    report(2)
-    camera = insertion.scene.camera.crop(*window)
+    camera = crop_camera(insertion.scene.camera, *window)
     coverage = _coverage(insertion, camera, samples, seed)
     background = (1 - coverage)[..., None]
     fade = insertion.fade[window]
@@ -256,7 +259,6 @@ def insert_object(
         for entries in pairs[0]
     ]
     renderings = [[insertion.render(entries, camera, samples, seed) for entries in pair] for pair in pairs]
-    report(3)
     # (2)
     without, with_object = renderings[0]
     shadow = _shadow(without, with_object, guides[0], coverage, fade)
@@ -273,7 +275,6 @@ def insert_object(
     result.composite[window] = part
     result.coverage[window] = coverage
     result.shadow[window] = shadow
-    report(STEPS)
     return result
 
 

@@ -171,6 +171,11 @@ def visible_window(
     return rows, columns
 
 
+def crop_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
+    """Return the camera of some rows and columns of the picture."""
+    return camera.window(columns.start, rows.start, 1.0, columns.stop - columns.start, rows.stop - rows.start)
+
+
 def traced_photo(
     scene: PhotoScene,
     samples: int,
@@ -193,7 +198,7 @@ def traced_photo(
     window = visible_window(points, scene.camera, world_from_camera)
     if floor:
         window = slice(0, scene.camera.height), slice(0, scene.camera.width)
-    view = sensor(scene.camera.crop(*window), world_from_camera, near_clip=scene.near_clip, alpha=True)
+    view = sensor(crop_camera(scene.camera, *window), world_from_camera, near_clip=scene.near_clip, alpha=True)
     picture = np.zeros((scene.camera.height, scene.camera.width, 4))
     picture[window] = render_denoised(entries, view, samples, 0, scene.max_depth)
     return picture

@@ -26,7 +26,7 @@ from factorlib.meshes.mesh import without_paint
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import AnyRecipe, is_light_file
 from factorlib.render.ground import on_floor
-from factorlib.render.insertion import NEW, STEPS, InsertionScene, compare_shadow, insert_object
+from factorlib.render.insertion import NEW, InsertionScene, compare_shadow, insert_object
 from factorlib.render.photo_scene import (
     Orbit,
     PhotoScene,
@@ -129,7 +129,8 @@ def write_resynthesis(
         materials = {**scene.materials, **replaced}
         scene = msgspec.structs.replace(scene, objects=tuple(objects), materials=materials)
     traced = TracedPicture(traced_photo(scene, recipe.samples), results.tone(photo))
-    _write_opaque(out / photo, traced.composite_over(results.photo(photo)))
+    background = results.photo(photo)
+    _write_opaque(out / photo, add_grain(traced.composite_over(background), background, traced.coverage[..., 0]))
 
 
 def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) -> InsertionScene:
@@ -200,14 +201,13 @@ def write_insertion(
         log.warning("%s: %s", photo, insertion.moved)
     linear = results.linear_photo(photo)
     covered = results.photo_mask(photo)
-    result = insert_object(insertion, linear, covered, recipe.samples, lambda done: report(done / STEPS))
+    result = insert_object(insertion, linear, covered, recipe.samples)
     match = compare_shadow(insertion, result, linear, covered)
     if match.doubtful:
         log.warning("%s: do not trust the shadow: %s", photo, CONTRADICTED)
     # Pixels that the new object does not change keep the photo's values exactly.
-    original = results.photo(photo)
-    edited = np.where(result.composite == linear, original, results.tone(photo)(result.composite))
-    _write_opaque(out / photo, add_grain(edited, original, result.coverage))
+    edited = np.where(result.composite == linear, results.photo(photo), results.tone(photo)(result.composite))
+    _write_opaque(out / photo, add_grain(edited, results.photo(photo), result.coverage))
     pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
     source = "that of dataset.yaml"
     if results.grounds[photo].ground is None:
