@@ -66,7 +66,7 @@ SLICES = {
     "dataset.ground",
 }
 MARK = "dataset.txt"
-SAMPLES = 64  # default samples per pixel
+SAMPLES = 32  # default samples per pixel
 LONGEST_SIDE = 480  # longer side of a photo in a notebook, pixels
 log = logging.getLogger("factorlib.result")
 

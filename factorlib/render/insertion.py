@@ -167,6 +167,10 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
         scene = (light or photo_light) | objects | entries
         return render_scene(scene, self.view(camera), samples, seed, ALL_BOUNCES, hide_emitters=True)
 
+    def guides(self, entries: dict[str, Any], camera: Camera, seed: int) -> Float[np.ndarray, "h w 10"]:
+        """Render guides of the denoiser; arguments as for `render`."""
+        return render_guides(self.entries[1] | entries, self.view(camera), GUIDE_SAMPLES, seed)
+
     def preview(self, entries: dict[str, Any], seed: int = 1, light: dict[str, Any] | None = None) -> Picture:
         """Render a preview of the photo's objects with further entries; arguments as for `render`."""
         return self.render(entries, self.preview_camera[0], PREVIEW_SAMPLES, seed, light)[..., :3]
@@ -224,11 +228,7 @@ class InsertionResult(msgspec.Struct, frozen=True):
 
 
 def insert_object(
-    insertion: InsertionScene,
-    photo: Picture,
-    covered: Bool[np.ndarray, "h w"],
-    samples: int,
-    seed: int = 1,
+    insertion: InsertionScene, photo: Picture, covered: Bool[np.ndarray, "h w"], samples: int, seed: int = 1
 ) -> InsertionResult:
     """Return the photo with the new object.
 
@@ -254,10 +254,7 @@ def insert_object(
     coverage = _coverage(insertion, camera, samples, seed)
     background = (1 - coverage)[..., None]
     fade = insertion.fade[window]
-    guides = [
-        render_guides(insertion.entries[1] | entries, insertion.view(camera), GUIDE_SAMPLES, seed)
-        for entries in pairs[0]
-    ]
+    guides = [insertion.guides(entries, camera, seed) for entries in pairs[0]]
     renderings = [[insertion.render(entries, camera, samples, seed) for entries in pair] for pair in pairs]
     # (2)
     without, with_object = renderings[0]
@@ -269,9 +266,8 @@ def insert_object(
         clean = [denoise_picture(*each)[..., :3] for each in zip(pair, guides)]
         mirrored = (clean[1] - clean[0]) * (pair[1] != pair[0])[..., :3] * shows_ground[window][..., None]
         part = np.maximum(part + mirrored * background * fade, 0)
-    result = InsertionResult(
-        photo.copy(), np.zeros(covered.shape), np.ones_like(photo), np.asarray(diffuse), previews[0][0]
-    )
+    whole = photo.copy(), np.zeros(covered.shape), np.ones_like(photo)
+    result = InsertionResult(*whole, np.asarray(diffuse), previews[0][0])
     result.composite[window] = part
     result.coverage[window] = coverage
     result.shadow[window] = shadow

@@ -70,6 +70,7 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
     for index, photo in enumerate(photos):
         try:
             report = partial(_report_photo, progress, index, len(photos), photo)
+            report(0)
             facts = WRITERS[type(recipe)](recipe, results, photo, out, report) or {}
             captions = [facts.pop("caption")] if facts else []
             if recipe.sun is not None:
@@ -109,7 +110,6 @@ def write_resynthesis(
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    report(0)
     scene = results.scene(photo, recipe.sun)
     if isinstance(recipe, kinds.TransferRecipe):
         table = results.with_table(recipe.table)
@@ -264,7 +264,6 @@ def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Pa
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    report(0)
     scene = results.scene(photo, recipe.sun)
     view: View = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
     if recipe.camera is not None:

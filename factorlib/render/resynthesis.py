@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -56,14 +55,6 @@ class PointEffects(msgspec.Struct, frozen=True):
 
     visibility: UInt8[np.ndarray, "n k"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
-
-
-class SampledLight(NamedTuple):
-    """Light at k directions: widened lobes of weight one, and radiance of each channel over its largest value."""
-
-    directions: Float[Tensor, "k 3"]
-    lobes: Float[Tensor, "k p"]
-    light: Float[Tensor, "k 3"]
 
 
 class Reflector:
@@ -112,26 +103,23 @@ class Reflector:
         result = np.zeros((2, len(normals), 3))
         step = max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
         optional = msgspec.structs.astuple(effects)
-        sampled = None if effects.visibility is None else self._sampled(effects.visibility.shape[1])
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
                 tensors = (None if values is None else self._tensor(values[rows]) for values in optional)
-                radiance = self._radiance(
-                    material, self._tensor(normals[rows]), self._tensor(views[rows]), *tensors, sampled
-                )
+                radiance = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), *tensors)
                 result[:, rows] = radiance.double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
 
-    def _sampled(self, count: int) -> SampledLight:
-        """Return the light at `count` directions; widened lobes keep their energy."""
+    def _sampled(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return k directions, widened lobes of weight one there [k, p], and the light over its largest value [k, 3]."""
         directions = torch.from_numpy(fibonacci_sphere(count)).float()
         lobes = kernel(directions, self.axis.float(), self.sharpness.float())
         wide = widened_sharpness(self.sharpness.double(), count).numpy()
         factor = lobe_energy(self.lobes.sharpness) / lobe_energy(wide)
         light = lobes @ torch.from_numpy(self.lobes.weight * factor[:, None]).float()
-        return SampledLight(directions, lobes, light / light.amax(0).clamp_min(1e-30))
+        return directions, lobes, light / light.amax(0).clamp_min(1e-30)
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(np.require(values, requirements=["C", "W"]), dtype=self.operator.dtype)
@@ -143,7 +131,6 @@ class Reflector:
         views: Float[Tensor, "n 3"],
         visibility: Float[Tensor, "n k"] | None,
         place: Float[Tensor, "n 3"] | None,
-        sampled: SampledLight | None,
     ) -> Float[Tensor, "2 n 3"]:
         parts = material.diffuse, material.specular, material.roughness
         kd, ks, roughness = (torch.tensor(part, dtype=self.operator.dtype) for part in parts)
@@ -158,12 +145,12 @@ class Reflector:
         diffuse = kd * ((larger * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
         specular = torch.zeros_like(diffuse)
         if visibility is not None:
+            directions, lobes, light = self._sampled(visibility.shape[1])
             visible = visibility.float() / 255
-            diffuse *= visible_share(visible, cosine_weights(normals.float(), sampled.directions), sampled.light)
+            diffuse *= visible_share(visible, cosine_weights(normals.float(), directions), light)
+            weights = highlight_weights(normals.float(), views.float(), directions, float(roughness))
+            larger = larger * visible_share(visible, weights, lobes).to(self.operator.dtype)
         if bool(ks.any()):
-            if visibility is not None:
-                weights = highlight_weights(normals.float(), views.float(), sampled.directions, float(roughness))
-                larger = larger * visible_share(visible, weights, sampled.lobes).to(self.operator.dtype)
             specular = ks * ((larger * self.operator.specular(roughness, self.sharpness, no, nz, oz)) @ self.weight)
         return torch.stack([diffuse, specular]) * (no[:, None] > 0)
 

@@ -26,7 +26,7 @@ from factorlib.results.metrics import PhotoErrors, ScoredLight
 from factorlib.urm.extract import with_surface_normals
 from factorlib.urm.observations import Observations, read_observations
 
-FIRST_SAMPLES = 64  # samples per pixel of the first screen's pictures, which take some seconds
+FIRST_SAMPLES = 16  # samples per pixel of the first screen's pictures
 AMPLIFICATION = 4  # factor on the difference between photo and re-synthesis
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB colour of pixels in the mask that are not compared
 DISAGREES = np.array([0.92, 1.0, 0.0])  # sRGB colour of pixels where mesh and mask name different materials
