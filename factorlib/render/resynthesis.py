@@ -113,7 +113,7 @@ class Reflector:
         return result
 
     def _sampled(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return k directions, widened lobes of weight one there [k, p], and the light over its largest value [k, 3]."""
+        """Return k directions, widened lobes there [k, p], and the light there over its largest value [k, 3]."""
         directions = torch.from_numpy(fibonacci_sphere(count)).float()
         lobes = kernel(directions, self.axis.float(), self.sharpness.float())
         wide = widened_sharpness(self.sharpness.double(), count).numpy()

@@ -9,12 +9,14 @@ from factorlib.images.tone import srgb_decode, srgb_encode
 RNG = np.random.default_rng(3)
 ROWS, COLUMNS = np.mgrid[:300, :400] / 400
 SMOOTH = np.stack([0.2 + 0.5 * ROWS, 0.3 + 0.4 * COLUMNS, 0.5 + 0.2 * np.sin(9 * COLUMNS)], axis=-1)
-SMOOTH[100:200:7] *= 0.6  # edges, which are no noise
+SMOOTH[100:200:7, ::9] *= 0.6  # detail, which is no noise
 MIX = np.array([[0.02, 0, 0], [0.015, 0.008, 0], [0.01, 0.0, 0.02]])  # channels that share a part of their noise
 
 
 def noisy(scale: float) -> np.ndarray:
-    return srgb_decode(SMOOTH + scale * RNG.standard_normal(SMOOTH.shape) @ MIX.T)
+    """With a third of the photo beyond white, where noise is cut off."""
+    encoded = SMOOTH + scale * RNG.standard_normal(SMOOTH.shape) @ MIX.T
+    return srgb_decode(np.where(COLUMNS[..., None] > 0.67, np.minimum(encoded + 0.5, 1), encoded))
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
