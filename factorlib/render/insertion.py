@@ -65,7 +65,7 @@ HAIR = 1e-4  # separation of surfaces that must not touch, in object sizes
 NEAR = 2.0  # radius in which shadows are compared, in object heights
 RIM = 2  # pixels beside the masks that the comparison of shadows leaves out
 FEWEST = 100  # least number of pixels for a comparison of shadows
-# Least correlation at which the predicted shadow is trusted.  On data/eames four photos have 0.40 to 0.91, and two 0.14
+# Least correlation at which the predicted shadow is trusted.  On data/eames four photos have 0.39 to 0.86, and two 0.22
 # and 0.09.
 BELIEVED = 0.3
 GROUND = "+ground"
