@@ -298,7 +298,9 @@ def denoise_picture(
     radiance, _ = np.split(_foreground(picture), [3], axis=-1)
     _, albedo, normal = np.split(_foreground(guides), [4, 7], axis=-1)
     aids = map(np.ascontiguousarray, (radiance, albedo.clip(0, 1), normal))
-    return np.concatenate([mitsuba_oidn.denoise(*aids, hdr=True, clean_aux=True).clip(0) * coverage, coverage], axis=-1)
+    clean = mitsuba_oidn.denoise(*aids, hdr=True, clean_aux=True).clip(0)
+    clean *= picture[..., :3].any(axis=(0, 1))  # a channel without light stays dark
+    return np.concatenate([clean * coverage, coverage], axis=-1)
 
 
 def _foreground(picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
