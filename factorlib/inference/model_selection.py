@@ -18,9 +18,8 @@ roughness   With few materials, the start decides which local minimum a fit reac
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
 
-Most effects are not there.  Interreflection and distances are therefore fitted only if a score test predicts a log
-Bayes factor of `PLAUSIBLE` (`factorlib.inference.score_test`), tone curves only if one step gains half of what they
-need.
+Most effects are not there.  Distances are therefore fitted only if a score test predicts a log Bayes factor of
+`PLAUSIBLE` (`factorlib.inference.score_test`), tone curves only if one step gains half of what they need.
 
 Models that are compared are fitted from one start with the same number of steps: one that got more descent would seem
 better.  Shadows and tone curves compare two models that are fitted to the same observations with reliable normals, by
@@ -233,17 +232,6 @@ def select_interreflection(sample: JointProblem, start: Fit, run: FitRunner) -> 
     """
     models = [sample.with_effects(True, with_bounces) for with_bounces in (False, True)]
     phase = "shadows and bounces"
-    bounced = {block.name: block.bounced for block in models[1].without_held_out().blocks}
-
-    def send(illumination: Illumination, share: float) -> Illumination:
-        """Return the illumination with a share of the radiance that surfaces send."""
-        radiance = bounced[illumination.block.name]
-        sent = None if radiance is None else share * radiance
-        return msgspec.structs.replace(illumination, block=msgspec.structs.replace(illumination.block, bounced=sent))
-
-    predicted = ScoreTest(models[0], start, run.prior).of_all_lights(send, 0.5, 1.0).log_bayes_factor
-    if predicted < PLAUSIBLE:
-        return Selection(start, [Decision(False, log_bayes_factor=predicted)])
     fits = [run.fit(phase, model, start, BOUNCE_SCHEDULE) for model in models]
     log_bayes_factor = (fits[0].value - fits[1].value) / 2
     decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)

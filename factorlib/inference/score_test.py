@@ -1,8 +1,7 @@
 """Score test: gain of a further effect, predicted from a fit without it (Rao 1948).
 
-Let ε_j ≥ 0 be sizes of effects, 0 in the fit: one over the distance of each light, or the share of the radiance that
-surfaces send each other.  With s a step of all other unknowns, the objective (1) of `factorlib.inference.optimizer` is
-to second order
+Let ε_j ≥ 0 be the size of an effect on light j, 0 in the fit: one over its distance.  With s a step of all other
+unknowns, the objective (1) of `factorlib.inference.optimizer` is to second order
 
     F(s, ε) = F + 2 gᵀs + sᵀH s + Σ_j (2 a_j ε_j + c_j ε_j² + 2 ε_j b_jᵀs).                                         (1)
 
@@ -13,12 +12,13 @@ Its minimum over s differs from that at ε = 0 by
 The predicted sizes minimise (2).  The predicted log Bayes factor of an effect is half of what its minimum rises without
 the effect.  a, b and c follow from φ and its gradient at sizes 0, δ and 2δ.  So a test costs gradients, where a fit
 costs factorisations.  Changes of log det H are neglected, and an effect of full size may be far from linear in ε: the
-prediction says whether a fit is worth its cost, and the fit decides.
+prediction says whether a fit is worth its cost, and the fit decides.  Of interreflection it is no guide: without it the
+scale of reflectances is open, and the test dropped what a fit supports (made set of seed 102).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -78,47 +78,34 @@ class ScoreTest:
             delta: δ.
             most: Largest ε.
         """
-        return self.predict([{k: terms} for k, terms in self._terms(effect, delta).items()], most)
-
-    def of_all_lights(self, effect: Effect, delta: float, most: float) -> Predicted:
-        """Return the prediction for the effect on all lights, with one ε."""
-        return self.predict([self._terms(effect, delta)], most)[0]
-
-    def _terms(self, effect: Effect, delta: float) -> dict[int, EffectTerms]:
-        """Return the terms of (1) by number of the light."""
-
-        def of_light(k: int) -> EffectTerms:
-            """Return the terms of one light."""
-            illumination = self.state.likelihoods[k].illumination
-            none = self.gradients[k]
-            half, full = (
-                light_likelihood(
-                    effect(illumination, size), self.fit.hyperparameters[k], self.prior, tables=self.problem.tables
-                ).gradient()
-                for size in (delta, 2 * delta)
-            )
-            # φ(ε) = φ + 2 a ε + c ε²
-            slope = (4 * half.value - full.value - 3 * none.value) / (4 * delta)
-            curvature = (full.value - 2 * half.value + none.value) / (2 * delta**2)
-            by_materials = (half.by_materials - none.by_materials).reshape(-1) / delta
-            return EffectTerms(slope, curvature, by_materials, (half.by_light - none.by_light) / delta)
-
         numbers = range(len(self.gradients))
-        return dict(zip(numbers, self.problem.spread(of_light, numbers), strict=True))
+        return self.predict(list(self.problem.spread(lambda k: self._terms(effect, delta, k), numbers)), most)
 
-    def predict(self, effects: list[dict[int, EffectTerms]], most: float) -> list[Predicted]:
-        """Return the predictions for effects of sizes 0 to `most`, given the terms of each by number of the light."""
-        vectors = []  # b_j
-        for terms in effects:
-            by_materials = np.sum([each.by_materials for each in terms.values()], axis=0)
-            lights = enumerate(self.gradients)
-            by_lights = [terms[k].by_light if k in terms else np.zeros_like(each.by_light) for k, each in lights]
-            vectors.append((by_materials, by_lights))
+    def _terms(self, effect: Effect, delta: float, k: int) -> EffectTerms:
+        """Return the terms of (1) of light k."""
+        likelihood = self.state.likelihoods[k]
+        none = self.gradients[k]
+        hyperparameters = self.fit.hyperparameters[k]
+        half, full = (
+            light_likelihood(
+                effect(likelihood.illumination, size), hyperparameters, self.prior, tables=self.problem.tables
+            ).gradient()
+            for size in (delta, 2 * delta)
+        )
+        # φ(ε) = φ + 2 a ε + c ε²
+        slope = (4 * half.value - full.value - 3 * none.value) / (4 * delta)
+        curvature = (full.value - 2 * half.value + none.value) / (2 * delta**2)
+        by_materials = (half.by_materials - none.by_materials).reshape(-1) / delta
+        return EffectTerms(slope, curvature, by_materials, (half.by_light - none.by_light) / delta)
+
+    def predict(self, terms: Sequence[EffectTerms], most: float) -> list[Predicted]:
+        """Return the predictions for an effect on each light, of sizes 0 to `most`."""
+        nothing = [np.zeros_like(each.by_light) for each in terms]
+        vectors = [(t.by_materials, [*nothing[:k], t.by_light, *nothing[k + 1 :]]) for k, t in enumerate(terms)]  # b_j
         solved = [self.arrow.solve(*vector) for vector in vectors]
-        curvatures = np.diag([sum(each.curvature for each in terms.values()) for terms in effects])
-        C = curvatures - [[_dot(vector, x) for x in solved] for vector in vectors]
-        slopes = [sum(each.slope for each in terms.values()) for terms in effects]
-        a = np.array(slopes) - [_dot(vector, self.newton) for vector in vectors]
+        bends = np.array([[_dot(vector, x) for x in solved] for vector in vectors])
+        C = np.diag([each.curvature for each in terms]) - bends
+        a = np.array([each.slope - _dot(vector, self.newton) for each, vector in zip(terms, vectors, strict=True)])
 
         def minimum(limits: Float[np.ndarray, " j"]) -> tuple[float, Float[np.ndarray, " j"]]:
             """Return the minimum of (2) and ε there, with ε up to these limits."""

@@ -56,24 +56,24 @@ def test_a_quadratic_is_minimised_exactly(of_three):
     free = np.append(np.isin(np.arange(21), test.arrow.free), np.ones(sum(lights), bool))
     hessian = np.linalg.inv(np.array(columns).T[np.ix_(free, free)])
     g = np.concatenate([test.material_gradient, *(each.by_light for each in test.gradients)])[free]
-    effects, vectors = [], []
-    for k in range(2):
+    terms, vectors = [], np.zeros((3, len(free)))
+    for k, first in enumerate(ends):
         of_materials, of_light = rng.normal(size=21), rng.normal(size=lights[k])
-        vectors.append(np.zeros(len(free)))
-        vectors[k][:21] = of_materials
-        vectors[k][21 + sum(lights[:k]) :][: lights[k]] = of_light
+        vectors[k, :21], vectors[k, first : first + lights[k]] = of_materials, of_light
         bend = float(vectors[k][free] @ np.linalg.solve(hessian, vectors[k][free]))
-        effects.append({k: EffectTerms(-9.0 * bend, 3 * bend, of_materials, of_light)})
-    B, c = np.array(vectors)[:, free], np.diag([terms[k].curvature for k, terms in enumerate(effects)])
-    slope = [terms[k].slope for k, terms in enumerate(effects)]
+        terms.append(EffectTerms(-9.0 * bend, 4 * bend, of_materials, of_light))
+    B, c, slope = (
+        vectors[:, free],
+        np.diag([each.curvature for each in terms]),
+        np.array([each.slope for each in terms]),
+    )
 
     def lowest(used):
         """The least of F with some effects, relative to F."""
-        whole, ends = np.block([[hessian, B[used].T], [B[used], c[np.ix_(used, used)]]]), np.array(slope)[used]
+        whole, ends = np.block([[hessian, B[used].T], [B[used], c[np.ix_(used, used)]]]), slope[used]
         return -np.append(g, ends) @ np.linalg.solve(whole, np.append(g, ends))
 
-    predicted = test.predict(effects, np.inf)
-    for k, each in enumerate(predicted):
-        assert each.size > 0 and each.log_bayes_factor == pytest.approx(
-            (lowest([1 - k]) - lowest([0, 1])) / 2, rel=1e-4
-        )
+    for k, each in enumerate(test.predict(terms, np.inf)):
+        others = [j for j in range(3) if j != k]
+        gain = (lowest(others) - lowest([0, 1, 2])) / 2
+        assert each.size > 0 and each.log_bayes_factor == pytest.approx(gain, rel=1e-4)
