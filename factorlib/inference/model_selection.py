@@ -47,7 +47,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import ndtri, stdtr
+from scipy.special import ndtr, ndtri, stdtr
 
 from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
@@ -149,6 +149,17 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
     margin = float(np.copysign(ndtri(max(stdtr(max(degrees, 1.0), -abs(t)), 1e-300)), t))
     loss_with, loss_without = (float(np.exp(share @ [log_pair[k] for log_pair in logs])) for k in (1, 0))
     return Decision(margin > least, loss_with, loss_without, margin)
+
+
+def for_any(number: int) -> float:
+    """Return the margin that the largest of `number` margins exceeds by chance as seldom as one exceeds `CLEARLY_FOR`.
+
+    Each light may get tone curves, so that many lights would often have one by chance (Bonferroni).
+
+    >>> for_any(1), round(for_any(6), 2)
+    (2.0, 2.67)
+    """
+    return float(-ndtri(ndtr(-CLEARLY_FOR) / number))
 
 
 class Selection(msgspec.Struct, frozen=True):
@@ -335,7 +346,7 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
         )
         without, with_curves = (held_out_losses(sample, fit.point) for fit in (plain, curved))
         pairs = ((without.one_light(k), with_curves.one_light(k)) for k in range(len(freed)))
-        return plain, curved, [compare_models(*pair, CLEARLY_FOR) for pair in pairs]
+        return plain, curved, [compare_models(*pair, for_any(len(freed))) for pair in pairs]
 
     plain, curved, compared = compare(ONE_STEP)
     if any(gains(decision, LEAST_TONE_GAIN / 2) for decision in compared):
