@@ -13,10 +13,12 @@ To update a package: `.venv/bin/python -m pip install -U <name>`, `make test`, `
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -31,16 +33,31 @@ LOCK = ROOT / "requirements.lock"
 VENV = ROOT / ".venv"
 READY = VENV / "ready"
 PYTHON = VENV / "bin" / "python"
+UV = VENV / "bin" / "uv"
+UV_PIN = "uv==0.13.9"
 TORCH = "torch==2.13.0"
 TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linux require gigabytes of CUDA.
+# imported once, in two processes at a time, so that their modules are compiled
 LOADED = (
-    "torch, scipy.optimize, mitsuba, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, xatlas, factorlib.geometry.open3d"
+    "torch, xatlas",
+    "scipy.optimize, mitsuba, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, factorlib.geometry.open3d",
 )
 # extras installed without dependencies: .venv has what they need; bpy would require an older NumPy, rembg OpenCV
 ALONE = ("blender", "interchange", "masks")
 # system libraries of Open3D and, for renders that are three times faster, of Mitsuba; and their Debian packages
 NEEDED = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1", "libgomp.so.1": "libgomp1"}
 FASTER = {"libLLVM.so.19.1": "libllvm19"}
+# options of pip's configuration, and the variables by which uv is told the same
+UV_VARIABLES = {
+    "index-url": "UV_DEFAULT_INDEX",
+    "extra-index-url": "UV_INDEX",
+    "find-links": "UV_FIND_LINKS",
+    "constraint": "UV_CONSTRAINT",
+    "trusted-host": "UV_INSECURE_HOST",
+    "cert": "SSL_CERT_FILE",
+    "client-cert": "SSL_CLIENT_CERT",
+    "proxy": "ALL_PROXY",
+}
 
 
 def main() -> None:
@@ -52,7 +69,8 @@ def main() -> None:
         check_system()
         install_packages()
         print("set-up: loading the packages for the first time", flush=True)
-        if subprocess.run([PYTHON, "-c", f"import {LOADED}"], cwd=ROOT).returncode:
+        processes = [subprocess.Popen([PYTHON, "-c", f"import {modules}"], cwd=ROOT) for modules in LOADED]
+        if {process.wait() for process in processes} != {0}:
             sys.exit("set-up: the packages are installed, but one does not load (reason above)")
         READY.write_text(digest)
     READY.touch()
@@ -67,7 +85,7 @@ def install_extras() -> None:
     for name in os.environ.get("EXTRAS", "").replace(",", " ").split():
         if name not in known:
             sys.exit(f"set-up: there is no extra {name!r} in pyproject.toml; there are {', '.join(known)}")
-        pip(*(["--no-deps"] if name in ALONE else ["-c", str(LOCK)]), *known[name])
+        install(*(["--no-deps"] if name in ALONE else ["-c", str(LOCK)]), *known[name])
 
 
 def make_venv() -> None:
@@ -89,18 +107,41 @@ def install_packages() -> None:
     A PyTorch from another index may need more packages (CUDA), which are installed, too.
     """
     index = os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
-    pip("--no-deps", "-r", str(LOCK))
-    options = ["--no-deps"] if index == TORCH_CPU else ["-c", str(LOCK)]
-    pip(*options, TORCH, *(["--index-url", index] if index else []))
+    if subprocess.run([PYTHON, "-m", "pip", "install", "-q", "--retries=1", "--only-binary=uv", UV_PIN]).returncode:
+        print(f"set-up: there is no {UV_PIN} here; pip installs the packages, in more time", flush=True)
+    install("--no-deps", "-r", str(LOCK))
+    install(*(["--no-deps"] if index == TORCH_CPU else ["-c", str(LOCK)]), TORCH, index=index)
     # The path is relative, so that the checkout can be moved.  `import factorlib` then works from anywhere.
     next(VENV.glob("lib/python*/site-packages")).joinpath("factorlib.pth").write_text("../../../..\n")
 
 
-def pip(*words: str) -> None:
-    """Install by the pip of .venv, which compiles nothing; a failure ends the program."""
-    print(f"set-up: installing {' '.join(words)}", flush=True)
-    if subprocess.run([PYTHON, "-m", "pip", "install", "-q", "--no-compile", *words], cwd=ROOT).returncode:
+def install(*words: str, index: str | None = None) -> None:
+    """Install by uv, or by pip where uv is missing or fails; a failure of both ends the program.
+
+    Neither compiles what it installs.  `index` takes the place of the configured index.
+    """
+    print(f"set-up: installing {' '.join(words)}{f' from {index}' if index else ''}", flush=True)
+    environment = uv_environment() | ({"UV_DEFAULT_INDEX": index, "PIP_INDEX_URL": index} if index else {})
+    by_uv = [UV, "pip", "install", "-q", "--python", PYTHON, *words]
+    by_pip = [PYTHON, "-m", "pip", "install", "-q", "--no-compile", *words]
+    if all(subprocess.run(command, env=environment).returncode for command in (by_uv, by_pip) if command[0].exists()):
         sys.exit("set-up: the packages could not be installed (reason above); correct that and run make again")
+
+
+def uv_environment() -> dict[str, str]:
+    """Return the environment of uv, with the settings of pip's configuration, which it does not read.
+
+    The best version of all indexes is taken, as pip does.  Variables of uv that are set have precedence.
+    """
+    variables = {"UV_INDEX_STRATEGY": "unsafe-best-match"}
+    command = [PYTHON, "-m", "pip", "config", "list"]
+    configuration = subprocess.run(command, stdout=subprocess.PIPE, text=True).stdout
+    for section in ("global", "install", ":env:"):  # A later one has precedence.
+        for option, value in re.findall(rf"^{section}\.([a-z-]+)=(.+)$", configuration, re.MULTILINE):
+            if option in UV_VARIABLES:
+                separator = "," if option == "find-links" else " "
+                variables[UV_VARIABLES[option]] = separator.join(ast.literal_eval(value).split())
+    return variables | os.environ
 
 
 def answers(url: str) -> bool:
@@ -119,9 +160,8 @@ def check_system() -> None:
     """
     packages = [package for library, package in (NEEDED | FASTER).items() if not loads(library)]
     if packages and os.geteuid() == 0 and shutil.which("apt-get"):
-        apt_get = ["env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-qq"]
-        subprocess.run([*apt_get, "update"], check=False)
-        subprocess.run([*apt_get, "install", "-y", "--no-install-recommends", *packages], check=False)
+        install = f"apt-get -qq update; apt-get -qq install -y --no-install-recommends {' '.join(packages)}"
+        subprocess.run(["env", "DEBIAN_FRONTEND=noninteractive", "sh", "-c", install])
     if missing := [library for library in NEEDED | FASTER if not loads(library)]:
         command = f"sudo apt-get update && sudo apt-get install -y {' '.join(packages)}"
         print(f"set-up: the system libraries {', '.join(missing)} are missing; install them:\n  {command}", flush=True)

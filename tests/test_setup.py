@@ -1,5 +1,9 @@
 """Set-up: which commands it gives to package clients, and what it says where something is missing."""
 
+import os
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import pytest
 
 from factorlib import setup
@@ -23,16 +27,18 @@ def test_a_library_that_is_missing_is_one_message_with_the_command_and_root_inst
         "libnone.so.9, libfast.so.1" in output
         and "apt-get update && sudo apt-get install -y libnone9 libfast1" in output
     )
-    calls, there = [], {"libnone.so.9"}
+    there = {"libnone.so.9"}
     lacking.setattr(setup, "loads", lambda name: name in there)
     setup.check_system()
     assert "the system libraries libfast.so.1 are missing" in capsys.readouterr().out
     there.clear()
+    calls = []
     lacking.setattr(setup.os, "geteuid", lambda: 0)
     install = lambda command, **_: calls.append(command[-1]) or there.update(setup.NEEDED, setup.FASTER)  # noqa: E731
     lacking.setattr(setup.subprocess, "run", install)
     setup.check_system()
-    assert calls == ["update", "libfast1"] and capsys.readouterr().out == ""
+    assert len(calls) == 1 and capsys.readouterr().out == ""
+    assert "update; apt-get" in calls[0] and calls[0].endswith(" libnone9 libfast1")
     setup.check_system()
     assert capsys.readouterr() == ("", "")
 
@@ -47,10 +53,11 @@ def test_another_python_is_refused(monkeypatch, tmp_path):
 
 @pytest.fixture
 def called(monkeypatch, tmp_path):
-    """The packages and options that pip would be called with.  PyTorch's index of CPU wheels answers."""
+    """The packages and options that are to be installed.  PyTorch's index of CPU wheels answers."""
     calls = []
     (tmp_path / "lib/python3.11/site-packages").mkdir(parents=True)
-    monkeypatch.setattr(setup, "pip", lambda *words: calls.append(list(words)))
+    monkeypatch.setattr(setup, "install", lambda *words, index=None: calls.append([*words, index]))
+    monkeypatch.setattr(setup.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
     monkeypatch.setattr(setup, "VENV", tmp_path)
     monkeypatch.setattr(setup, "answers", lambda url: True)
     monkeypatch.delenv("TORCH_INDEX", raising=False)
@@ -64,22 +71,66 @@ def called(monkeypatch, tmp_path):
 def test_extras_are_installed_alone_or_move_nothing_of_the_lock(called, monkeypatch, extras, expected):
     monkeypatch.setenv("EXTRAS", extras)
     setup.install_extras()
-    bare = [[word.split("=")[0].split(">")[0] for word in words if word != str(setup.LOCK)] for words in called]
+    bare = [[word.split("=")[0].split(">")[0] for word in words[:-1] if word != str(setup.LOCK)] for words in called]
     assert bare == expected
     monkeypatch.setenv("EXTRAS", "dusk")
     with pytest.raises(SystemExit, match="there is no extra 'dusk'"):
         setup.install_extras()
 
 
-def test_the_lock_is_installed_and_torch_apart_from_its_index(called, monkeypatch, tmp_path):
+def test_the_lock_is_installed_and_torch_apart_from_its_index(called, monkeypatch, tmp_path, capsys):
     setup.install_packages()
-    locked = ["--no-deps", "-r", str(setup.LOCK)]
-    assert called == [locked, ["--no-deps", setup.TORCH, "--index-url", setup.TORCH_CPU]]
+    locked = ["--no-deps", "-r", str(setup.LOCK), None]
+    assert called == [locked, ["--no-deps", setup.TORCH, setup.TORCH_CPU]]
+    assert f"no {setup.UV_PIN} here" in capsys.readouterr().out
     assert next(tmp_path.rglob("factorlib.pth")).read_text() == "../../../..\n"
     monkeypatch.setenv("TORCH_INDEX", "https://example.org/cuda")
     setup.install_packages()
-    assert called[2:] == [locked, ["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"]]
+    assert called[2:] == [locked, ["-c", str(setup.LOCK), setup.TORCH, "https://example.org/cuda"]]
     monkeypatch.delenv("TORCH_INDEX")
     monkeypatch.setattr(setup, "answers", lambda url: False)
     setup.install_packages()
-    assert called[4:] == [locked, ["-c", str(setup.LOCK), setup.TORCH]]
+    assert called[4:] == [locked, ["-c", str(setup.LOCK), setup.TORCH, None]]
+
+
+@pytest.mark.parametrize("has_uv, codes, programs", [
+    (True, [0], ["uv"]), (True, [1, 0], ["uv", "python"]), (False, [0], ["python"]), (True, [1, 1], ["uv", "python"]), (False, [1], ["python"]),
+])  # fmt: skip
+def test_pip_installs_where_uv_is_missing_or_fails(monkeypatch, tmp_path, has_uv, codes, programs):
+    commands = []
+    monkeypatch.setattr(setup, "UV", tmp_path / "uv")
+    if has_uv:
+        setup.UV.touch()
+    monkeypatch.setattr(setup, "uv_environment", dict)
+    results = iter(codes)
+    run = lambda command, env: commands.append((command, env)) or SimpleNamespace(returncode=next(results))  # noqa: E731
+    monkeypatch.setattr(setup.subprocess, "run", run)
+    with pytest.raises(SystemExit, match="could not be installed") if codes[-1] else nullcontext():
+        setup.install("torch", index="https://example.org/cuda")
+    assert [command[0].name for command, _ in commands] == programs
+    for command, environment in commands:
+        assert command[-1] == "torch" and set(environment.values()) == {"https://example.org/cuda"}
+
+
+def test_uv_is_told_what_pip_is_configured_for(monkeypatch, tmp_path):
+    for name in [name for name in os.environ if name.startswith(("PIP_", "UV_", "SSL_CERT"))]:
+        monkeypatch.delenv(name)
+    (tmp_path / "pip.conf").write_text(
+        "[global]\nindex-url = https://example.org/simple\nextra-index-url =\n  https://a.example\n  https://b.example\n"
+        "find-links = /wheels /more\ncert = /ca.pem\nproxy = http://name:it's@proxy:80\ntimeout = 60\n"
+        "[install]\nindex-url = https://example.org/install\n[download]\ncert = /other.pem\n"
+    )
+    monkeypatch.setenv("PIP_CONFIG_FILE", str(tmp_path / "pip.conf"))
+    expected = {
+        "UV_INDEX_STRATEGY": "unsafe-best-match",
+        "UV_DEFAULT_INDEX": "https://example.org/install",
+        "UV_INDEX": "https://a.example https://b.example",
+        "UV_FIND_LINKS": "/wheels,/more",
+        "SSL_CERT_FILE": "/ca.pem",
+        "ALL_PROXY": "http://name:it's@proxy:80",
+    }
+    assert expected.items() <= setup.uv_environment().items()
+    monkeypatch.setenv("PIP_INDEX_URL", "https://example.org/env")
+    monkeypatch.setenv("UV_FIND_LINKS", "/mine")
+    expected |= {"UV_DEFAULT_INDEX": "https://example.org/env", "UV_FIND_LINKS": "/mine"}
+    assert expected.items() <= setup.uv_environment().items()
