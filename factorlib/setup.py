@@ -122,9 +122,11 @@ def install(*words: str, index: str | None = None) -> None:
     """
     print(f"set-up: installing {' '.join(words)}{f' from {index}' if index else ''}", flush=True)
     environment = uv_environment() | ({"UV_DEFAULT_INDEX": index, "PIP_INDEX_URL": index} if index else {})
-    by_uv = [UV, "pip", "install", "-q", "--python", PYTHON, *words]
-    by_pip = [PYTHON, "-m", "pip", "install", "-q", "--no-compile", *words]
-    if all(subprocess.run(command, env=environment).returncode for command in (by_uv, by_pip) if command[0].exists()):
+    by_uv = [str(UV), "pip", "install", "-q", "--python", str(PYTHON), *words]
+    by_pip = [str(PYTHON), "-m", "pip", "install", "-q", "--no-compile", *words]
+    if all(
+        subprocess.run(command, env=environment).returncode for command in (by_uv, by_pip) if Path(command[0]).exists()
+    ):
         sys.exit("set-up: the packages could not be installed (reason above); correct that and run make again")
 
 
@@ -134,10 +136,9 @@ def uv_environment() -> dict[str, str]:
     The best version of all indexes is taken, as pip does.  Variables of uv that are set have precedence.
     """
     variables = {"UV_INDEX_STRATEGY": "unsafe-best-match"}
-    command = [PYTHON, "-m", "pip", "config", "list"]
-    configuration = subprocess.run(command, stdout=subprocess.PIPE, text=True).stdout
+    listing = subprocess.run([PYTHON, "-m", "pip", "config", "list"], stdout=subprocess.PIPE, text=True)
     for section in ("global", "install", ":env:"):  # A later one has precedence.
-        for option, value in re.findall(rf"^{section}\.([a-z-]+)=(.+)$", configuration, re.MULTILINE):
+        for option, value in re.findall(rf"^{section}\.([a-z-]+)=(.+)$", listing.stdout, re.MULTILINE):
             if option in UV_VARIABLES:
                 separator = "," if option == "find-links" else " "
                 variables[UV_VARIABLES[option]] = separator.join(ast.literal_eval(value).split())

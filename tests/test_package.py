@@ -84,9 +84,7 @@ def run(site, *words, cwd):
     return subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
 
 
-def test_an_installed_wheel_has_its_command_and_its_operator(installed, tmp_path):
-    process = run(installed, str(installed / "bin" / "factorlib"), "--help", cwd=tmp_path)
-    assert process.returncode == 0 and "usage: factorlib" in process.stdout and "validate" in process.stdout
+def test_an_installed_wheel_has_its_operator(installed, tmp_path):
     code = "import factorlib; from factorlib.reflection import reflection_operator; print(factorlib.__file__, reflection_operator('network'))"
     process = run(installed, "-c", code, cwd=tmp_path)
     assert process.returncode == 0 and process.stdout.startswith(str(installed)), process.stderr

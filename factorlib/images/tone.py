@@ -39,7 +39,8 @@ def slope(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float)
 def by_log_exponent(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
     """Return dτ/d log g, the derivative of the tone curve (1) with respect to its log exponent."""
     term_x, term_black, term_one = (end**exponent * np.log(end) for end in (x + TOE, TOE, 1 + TOE))
-    return exponent * (term_x - term_black - curve(x, exponent) * (term_one - term_black)) / _range(exponent)
+    rise = term_x - term_black - curve(x, exponent) * (term_one - term_black)
+    return exponent * rise / _range(exponent)
 
 
 def apply_tone(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:

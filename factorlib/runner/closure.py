@@ -19,7 +19,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +198,7 @@ def _data_files(folder: Path) -> Iterator[Path]:
             yield path
 
 
+@cache
 def _installed() -> dict[str, dict[str, str]]:
     """Return {imported name: {distribution: version}} of all installed packages."""
     from importlib.metadata import packages_distributions, version

@@ -76,12 +76,12 @@ def test_what_is_left_out_is_unknown_not_background():
         label[:, int(np.quantile(np.nonzero(label)[1], 0.7)) :] = UNKNOWN
         return Silhouette(label)
 
-    assert searched(chair(), 9, occluded)[1] < 2
+    assert searched(chair(), 9, occluded, **SMALL)[1] < 2
 
 
 def test_labels_settle_what_the_shape_cannot():
     """The photo shows the ends the other way round than the second mesh: the pose turns by half a turn."""
-    estimate, error = searched(dumbbell((1, 2)), 10)
+    estimate, error = searched(dumbbell((1, 2)), 10, **SMALL)
     other, _ = searched(dumbbell((1, 2)), 10, given=Caster(dumbbell((2, 1))), **SMALL)
     assert error < 2 and estimate.score > 0.97 and angle_between(estimate.state.rotation, other.state.rotation) > 60
 

@@ -132,7 +132,7 @@ def errors_of_lights(factor: float, seed: int) -> np.ndarray:
 def test_lights_are_nearest_to_the_truth_with_the_factor_in_use_where_normals_are_wrong():
     """It makes directions that are dark in truth hardly brighter: sorted by the estimate, they would look better the less a light varies."""
     trusting, used, doubting = (
-        np.vstack([errors_of_lights(factor, seed) for seed in (1, 2, 3)]).mean(0)
+        np.vstack([errors_of_lights(factor, seed) for seed in (1, 2)]).mean(0)
         for factor in (1.0, LIGHT_TEMPERATURE, 4 * LIGHT_TEMPERATURE)
     )
     assert used[0] < 0.95 * trusting[0] and used[0] < 0.97 * doubting[0]

@@ -212,8 +212,8 @@ def off_lamp(light: Light) -> float:
 
 
 def test_a_map_becomes_a_light_of_its_energy_in_its_directions(monkeypatch):
-    monkeypatch.setattr("factorlib.inference.known.MAP_ROWS", 50)
-    radiance = lamp((lat_long_directions(50, 100) @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(50, 100, 3)
+    monkeypatch.setattr("factorlib.inference.known.MAP_ROWS", 40)
+    radiance = lamp((lat_long_directions(40, 80) @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(40, 80, 3)
     light = light_from_map(radiance)
     np.testing.assert_allclose(light.energy.sum(0), map_energy(radiance), rtol=1e-3)
     assert light.fixed.all() and light.scale_free and off_lamp(light) < 0.3

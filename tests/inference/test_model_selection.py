@@ -43,7 +43,7 @@ from tests.inference.made import bowls, none_held_out, rough_light
 from tests.inference.made_lights import OPERATOR, PRIOR, begun, drawn, on_even_cells, spheres
 
 QUICK = SolveOptions(cells=60, splittings=0, observations=300)
-OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
+OF_SHAPES = msgspec.structs.replace(QUICK, cells=36, observations=180, tone="off")  # shadows and bounces
 # an exponent that all photos share is known less
 MANY = msgspec.structs.replace(QUICK, observations=1000)
 
@@ -133,7 +133,7 @@ def test_bounces_of_a_hull_without_hollows_do_not_darken_the_materials():
     assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
 
 
-def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(shaded):
+def test_shadows_that_are_none_are_given_up(shaded):
     rng = np.random.default_rng(0)
     open_ = spheres([on_even_cells(drawn(k, 80)) for k in range(2)], size=10).blocks
 
@@ -146,7 +146,6 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
     result = solved(wrong, **few)
     assert not result.shadows.accepted and result.shadows.margin < CLEARLY_AGAINST
     assert solved(wrong, **few, self_shadowing="on").shadows.accepted
-    assert solved(hiding(lambda b: np.full((len(b), 96), 255)), **few).shadows.accepted
 
 
 # ── tone curves ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -254,7 +253,8 @@ def test_models_that_predict_the_same_are_equal_evidence(begun_rooms, monkeypatc
         )
         for columns in (open_, {"place": lambda b: np.zeros((len(b), 3))})
     )
-    assert select_effects(shaded, [fit], QUICK, FitRunner()).shadows.margin == pytest.approx(0, abs=1e-6)
+    shadows = select_effects(shaded, [fit], QUICK, FitRunner()).shadows
+    assert shadows.accepted and shadows.margin == pytest.approx(0, abs=1e-6)
     guess = msgspec.structs.replace(fit, fitted=False)
     assert select_effects(shaded, [guess], QUICK, FitRunner()).shadows.margin == pytest.approx(0, abs=1e-6)
     for decision in select_distances(central, fit, QUICK, FitRunner()).evidence:

@@ -201,7 +201,6 @@ def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
 
 CHOICES = SolveOptions(cells=24, splittings=1, observations=100)
 PARTS = ("effects", "tone", "distances", "materials", "prior", "lights", "suns")
-SHORT = ("lights",)  # of PARTS, those that make test kills after
 ALL = tuple(PHASES)
 
 
@@ -271,7 +270,8 @@ class Fragile(Checkpoint):
             raise Killed
 
 
-@pytest.mark.parametrize("part", [pytest.param(p, marks=[pytest.mark.long] * (p not in SHORT)) for p in PARTS])
+@pytest.mark.long
+@pytest.mark.parametrize("part", PARTS)
 def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp_path, part):
     path = tmp_path / "solve.pt"
     with pytest.raises(Killed):

@@ -227,7 +227,7 @@ def ball_maps(size: int) -> tuple[dict, dict]:
 )
 def test_interpolated_pixels_are_those_that_the_operator_gives(roughness, share, monkeypatch):
     """Of a large ball, of which only a share is evaluated: the rim, and more with narrower highlights."""
-    photo, geometry = ball_maps(200)
+    photo, geometry = ball_maps(140)
     reflector, material = (
         Reflector(reflection_operator("network"), cells(60.0)),
         msgspec.structs.replace(GLOSSY, roughness=roughness),

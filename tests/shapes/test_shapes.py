@@ -106,7 +106,7 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
 )
 def test_proportions_of_primitives_are_found(kind, sides):
     mesh = unit_shape(kind, np.array(sides)).as_mesh()
-    poses, camera = (looking_from(25, 20), looking_from(40, 60)), Camera(160, 120, 200.0, (80.0, 60.0))
+    poses, camera = (looking_from(25, 20), looking_from(40, 60)), Camera(96, 72, 120.0, (48.0, 36.0))
     shape = primitive(kind, [outline(mesh, pose, False, camera) for pose in poses])
     assert np.sort(np.ptp(shape.vertices, axis=0)) == pytest.approx(np.sort(sides), abs=0.02)
     assert shape.overlap > 0.97 and solid(shape).is_watertight and solid(shape).volume > 0

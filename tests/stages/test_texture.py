@@ -26,7 +26,7 @@ from tests.refusal import refusal
 from tests.runner.toy import files_of
 from tests.stages.made import Rising
 
-CAMERA = Camera(64, 64, 90.0, (32.0, 32.0))
+CAMERA = Camera(48, 48, 68.0, (24.0, 24.0))
 TURNS = {"a": 0.0, "b": 35.0, "c": -40.0}
 MATERIAL = {"diffuse": [0.5, 0.4, 0.3], "specular": [0.04, 0.04, 0.04], "roughness": 0.4}
 
@@ -40,7 +40,7 @@ def photographed(folder: Path, paint) -> Inputs:
     """What the stages before leave of three photos of a painted ball, each in a light of its own."""
     for stage in ("align", "masks", "solve", "shading"):
         (folder / stage).mkdir(parents=True)
-    write_obj(folder / "ball.obj", (1, 1, 1))
+    write_obj(folder / "ball.obj", (1, 1, 1), rows=28)
     ball = read_mesh(folder / "ball.obj", ["red"], "red")
     lights = {name: light(k) for k, name in enumerate(TURNS)}
     entry = {"camera": {}, "objects": [{"name": "ball", "mesh": "ball"}]}
@@ -53,7 +53,7 @@ def photographed(folder: Path, paint) -> Inputs:
         point = CAMERA.rays_through(np.column_stack([x, y]) + 0.5)
         point = point / point[:, 2:] * maps.depth[y, x, None]
         reflect = Reflector(reflection_operator("network"), lights[name])
-        radiance = np.zeros((64, 64, 3))
+        radiance = np.zeros((CAMERA.height, CAMERA.width, 3))
         normals, views = (each[y, x].astype(float) for each in (maps.normal, maps.view))
         diffuse, specular = reflect.parts(Reflectance(**MATERIAL), normals, views)
         radiance[y, x] = diffuse * paint((point - pose.translation) @ pose.rotation) + specular
