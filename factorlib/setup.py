@@ -1,7 +1,8 @@
 """Set-up of the environment: .venv with the pinned packages, and the few system libraries they need.
 
 The Makefile runs it as a script, on a Python without packages, so only the standard library may be imported here;
-`lock_text` alone imports a package.
+`lock_text` alone imports a package.  uv installs what the lock names, from the indexes that pip is configured for, and
+pip where uv is not available.
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for another PyTorch, e.g. with CUDA)
     .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="dask blender": extras of pyproject.toml, into .venv)
@@ -135,14 +136,13 @@ def uv_environment() -> dict[str, str]:
 
     The best version of all indexes is taken, as pip does.  Variables of uv that are set have precedence.
     """
-    variables = {"UV_INDEX_STRATEGY": "unsafe-best-match"}
     listing = subprocess.run([PYTHON, "-m", "pip", "config", "list"], stdout=subprocess.PIPE, text=True)
-    for section in ("global", "install", ":env:"):  # A later one has precedence.
-        for option, value in re.findall(rf"^{section}\.([a-z-]+)=(.+)$", listing.stdout, re.MULTILINE):
-            if option in UV_VARIABLES:
-                separator = "," if option == "find-links" else " "
-                variables[UV_VARIABLES[option]] = separator.join(ast.literal_eval(value).split())
-    return variables | os.environ
+    configured = {
+        UV_VARIABLES[option]: ("," if option == "find-links" else " ").join(ast.literal_eval(value).split())
+        for section in ("global", "install", ":env:")  # A later one has precedence.
+        for option, value in re.findall(rf"^{section}\.({'|'.join(UV_VARIABLES)})=(.+)$", listing.stdout, re.MULTILINE)
+    }
+    return {"UV_INDEX_STRATEGY": "unsafe-best-match", **configured, **os.environ}
 
 
 def answers(url: str) -> bool:

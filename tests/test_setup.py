@@ -93,23 +93,25 @@ def test_the_lock_is_installed_and_torch_apart_from_its_index(called, monkeypatc
     assert called[4:] == [locked, ["-c", str(setup.LOCK), setup.TORCH, None]]
 
 
-@pytest.mark.parametrize("has_uv, codes, programs", [
-    (True, [0], ["uv"]), (True, [1, 0], ["uv", "python"]), (False, [0], ["python"]), (True, [1, 1], ["uv", "python"]), (False, [1], ["python"]),
-])  # fmt: skip
-def test_pip_installs_where_uv_is_missing_or_fails(monkeypatch, tmp_path, has_uv, codes, programs):
-    commands = []
-    monkeypatch.setattr(setup, "UV", tmp_path / "uv")
-    if has_uv:
-        setup.UV.touch()
-    monkeypatch.setattr(setup, "uv_environment", dict)
-    results = iter(codes)
-    run = lambda command, env: commands.append((command, env)) or SimpleNamespace(returncode=next(results))  # noqa: E731
+@pytest.mark.parametrize(
+    "codes", [{"uv": 0}, {"uv": 1, "python": 0}, {"python": 0}, {"uv": 1, "python": 1}, {"python": 1}]
+)
+def test_pip_installs_where_uv_is_missing_or_fails(monkeypatch, tmp_path, codes):
+    called = []
+    for name in codes:
+        (tmp_path / name).touch()
+
+    def run(command, env):
+        assert command[-1] == "torch" and set(env.values()) == {"https://example.org/cuda"}
+        called.append(os.path.basename(command[0]))
+        return SimpleNamespace(returncode=codes[called[-1]])
+
+    for name, value in {"UV": tmp_path / "uv", "PYTHON": tmp_path / "python", "uv_environment": dict}.items():
+        monkeypatch.setattr(setup, name, value)
     monkeypatch.setattr(setup.subprocess, "run", run)
-    with pytest.raises(SystemExit, match="could not be installed") if codes[-1] else nullcontext():
+    with pytest.raises(SystemExit, match="could not be installed") if all(codes.values()) else nullcontext():
         setup.install("torch", index="https://example.org/cuda")
-    assert [os.path.basename(command[0]) for command, _ in commands] == programs
-    for command, environment in commands:
-        assert command[-1] == "torch" and set(environment.values()) == {"https://example.org/cuda"}
+    assert called == list(codes)
 
 
 def test_uv_is_told_what_pip_is_configured_for(monkeypatch, tmp_path):
