@@ -99,14 +99,11 @@ def darkened(block):
 
 
 def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_left_out(lit):
-    solution = solve(lit, start_from_photos(3), QUICK)
-    assert [each.accepted for each in solution.backgrounds] == [True] * 3
-    error = log_scale(solution)
-    assert error < 0.2
     blocks = [lit.blocks[0], darkened(lit.blocks[1]), lit.blocks[2]]
     solution = solve(lit.with_blocks(blocks), start_from_photos(3), QUICK)
     assert [each.accepted for each in solution.backgrounds] == [True, False, True]
-    assert log_scale(solution) < 0.2
+    error = log_scale(solution)
+    assert error < 0.2
     off = solve(lit, start_from_photos(3), msgspec.structs.replace(QUICK, background="off"))
     assert not any(each.accepted for each in off.backgrounds) and log_scale(off) > error + 0.1
 
