@@ -70,6 +70,7 @@ def test_a_descent_with_known_unknowns_is_that_of_a_prior_that_holds_them(monkey
     """Against the slow and obvious: a penalty of 1e7 on the unknowns that are known."""
     monkeypatch.setattr(optimizer, "TOLERANCE", 1e-9)
     monkeypatch.setattr(optimizer, "DECREMENT", 1e-6)
+    monkeypatch.setattr(optimizer, "DECREMENT_SHARE", 1e-6)
     problem, _ = photographed(5, 1, cells=40, size=10)
     known = KnownValues({1: np.array([0.2, 0.4, 0.25, np.nan, np.nan, np.nan, 0.4])})
     free, theta = known.free(3), material_unknowns(START)
