@@ -1,9 +1,9 @@
 """Exchange of paint and light: the solve and the textures once more, each with what the other found.
 
 `texture` estimates paint in lights that were estimated without it, so lights and specular parts explain some of the
-paint.  Where a texture is kept, the problem is solved again with the textures as detail of the surface, the photos are
-shaded in these lights, and the textures are estimated again.  The exchange is kept if the textures then predict photos
-better that they were not estimated from.
+paint.  Where a texture is kept, the solve continues with the textures as detail of the surface and with its choices of
+the model.  The photos are shaded in these lights, and the kept textures are estimated again with their stiffness.  The
+exchange is kept if the textures then predict photos better that they were not estimated from.
 
 Writes exchange.json.  If the exchange is kept, the folders `solve`, `shading` and `texture` are new results of these
 stages, which replace theirs (`factorlib.results.exchange`).
@@ -56,7 +56,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_json(out / FILE, Exchange(False))
         return
     with held_back() as warnings:
-        solve_again(params, inputs, out, progress)
+        solve_again(params, inputs, out, progress, before)
     losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
     kept = losses[1] < losses[0]
     for warning in warnings if kept else ():
@@ -79,17 +79,19 @@ def held_back() -> Iterator[list[logging.LogRecord]]:
         LIBRARY.handlers, LIBRARY.propagate = handlers, propagate
 
 
-def solve_again(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Solve with the textures as detail of the surface, shade in the new lights, and estimate the textures again."""
+def solve_again(params: Params, inputs: Inputs, out: Path, progress: Progress, before: TextureTable) -> None:
+    """Solve with the textures as detail of the surface, shade in the new lights, and estimate the textures again.
+
+    The choices of the solve, and the kept textures with their stiffness, are those of before.
+    """
     for name in REPLACED:
         (out / name).mkdir()
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     first, second = SHARES
     with TemporaryDirectory() as folder:
         painted = paint_surface(inputs, Path(folder), list(lights))
-        stages.solve.main(
-            params.solve, with_folders(inputs, surface=painted), out / "solve", part_of(progress, 0, first)
-        )
+        continued = with_folders(inputs, surface=painted, start=inputs["solve"])
+        stages.solve.main(params.solve, continued, out / "solve", part_of(progress, 0, first), decided=True)
     solved = with_folders(inputs, solve=out / "solve")
 
     def shade(name: str) -> None:
@@ -101,7 +103,7 @@ def solve_again(params: Params, inputs: Inputs, out: Path, progress: Progress) -
 
     inputs.map(shade, list(lights))
     shaded = with_folders(solved, shading=out / "shading")
-    stages.texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1))
+    stages.texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1), before)
 
 
 def paint_surface(inputs: Inputs, folder: Path, photos: list[str]) -> Path:

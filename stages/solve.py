@@ -52,7 +52,7 @@ from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Name
 from factorlib.results.lobe_table import write_lobes
-from factorlib.results.materials import Channels, vec3
+from factorlib.results.materials import Channels, Model, vec3
 from factorlib.results.solution import EarlierSolution, read_earlier_solution
 from factorlib.results.surface_table import BEGINNING
 from factorlib.stage import Inputs, Progress
@@ -88,8 +88,16 @@ class Params(options.SolveOptions, frozen=True, forbid_unknown_fields=True):
     """Weight of the prior on the tint of lights, for the paper's solver."""
 
 
-def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Read the observations, solve, estimate standard errors, and write all of it."""
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress, decided: bool = False) -> None:
+    """Read the observations, solve, estimate standard errors, and write all of it.
+
+    Args:
+        params: Parameters of the stage.
+        inputs: Inputs of the stage.
+        out: Folder to write to.
+        progress: Called with the completed work, its total and the current activity.
+        decided: True to keep all choices of the model of the earlier solution in the folder `start`.
+    """
     names: list[str] = inputs.facts["dataset.materials"]
     progress(0, 1, "observations")
     read = count(1)
@@ -113,7 +121,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     )
     problem = _build_problem(params, inputs, declared, observations, relative)
     _warn(before_solving(names, observations.photos, problem))
-    solution = _run_solver(params, problem, earlier, inputs, partial(_share, progress))
+    model = earlier.table.model if earlier and decided else None
+    solution = _run_solver(params, problem, earlier, inputs, partial(_share, progress), model)
     systems = len(problem.blocks) * (1 if params.solver == "joint" else 2)
     counter = count(1)
 
@@ -216,7 +225,12 @@ def _build_problem(
 
 
 def _run_solver(
-    params: Params, problem: JointProblem, earlier: EarlierSolution | None, inputs: Inputs, progress: Progress
+    params: Params,
+    problem: JointProblem,
+    earlier: EarlierSolution | None,
+    inputs: Inputs,
+    progress: Progress,
+    decided: Model | None,
 ) -> Solution:
     """Return the solution of the chosen solver.
 
@@ -226,6 +240,7 @@ def _run_solver(
         earlier: Earlier solution to start from, or None.
         inputs: Inputs of the stage.
         progress: Called with the completed work, its total and the current activity.
+        decided: Choices that are not made again; None to make them.
     """
     names = inputs.facts["dataset.materials"]
     if params.solver == "paper":
@@ -238,7 +253,7 @@ def _run_solver(
         else _surface_start(inputs, problem) or start_from_photos(len(names))
     )
     choices = with_earlier_decisions(params, earlier) if earlier else params
-    return solve(problem, start, choices, FitRunner(unfinished, solve_progress(progress)))
+    return solve(problem, start, choices, FitRunner(unfinished, solve_progress(progress)), decided)
 
 
 def _held_out_photos(

@@ -6,7 +6,7 @@ Every pixel observes the factor of its surface point on the diffuse reflectance,
 Writes texture.json, and if a texture is kept, factors.parquet and photos/<photo>.exr: the factors at every pixel.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -21,7 +21,7 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.tone import invert_tone
 from factorlib.inference.aligned_photo import AlignedPhoto, read_aligned_photos, visible_meshes
 from factorlib.inference.surface_turns import Surfaces
-from factorlib.inference.texture import TextureSamples, observe_texture, select_texture
+from factorlib.inference.texture import STIFFNESSES, TextureSamples, observe_texture, select_texture
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
@@ -66,8 +66,16 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Longest edge of the textured mesh, in pixels of a typical photo."""
 
 
-def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Estimate the texture of every material on every mesh, and write those that are kept."""
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress, before: TextureTable | None = None) -> None:
+    """Estimate the texture of every material on every mesh, and write those that are kept.
+
+    Args:
+        params: Parameters of the stage.
+        inputs: Inputs of the stage.
+        out: Folder to write to.
+        progress: Called with the completed work, its total and the current activity.
+        before: Earlier result, whose kept textures alone are estimated again, with their stiffness; None to choose.
+    """
     names = inputs.facts["dataset.materials"]
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     surface = read_surface(inputs.folders.get("surface"))
@@ -87,18 +95,24 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
     solved = SolvedPhotos(inputs, photos, lights, read_materials(inputs["solve"] / "materials.json"), report)
     # a coarse trial, then the promising ones at the photos' resolution
-    coarse = {name: subdivided_mesh(mesh, TRIAL_EDGE) for name, mesh in meshes.items()}
-    estimates = solved.estimate(coarse, None, TRIAL_STEP)
-    promising = {key for key, trial in estimates.items() if trial.promising}
+    estimates: dict[Key, Estimate] = {}
+    rejected = [each for each in before.textures if not each.kept] if before else []
+    decided = {(each.mesh, each.material): each.by.stiffness for each in before.textures if each.kept} if before else {}
+    promising = set(decided)
+    if before is None:
+        coarse = {name: subdivided_mesh(mesh, TRIAL_EDGE) for name, mesh in meshes.items()}
+        estimates = solved.estimate(coarse, None, TRIAL_STEP)
+        promising = {key for key, trial in estimates.items() if trial.promising}
     visible = [name for name in meshes if any(mesh == name for mesh, _ in promising)]
     longest = {name: longest_edge(name, meshes[name], photos, params.edge) for name in visible}
     fine = {name: subdivided_mesh(meshes[name], edge) for name, edge in longest.items()}
     if promising:
-        estimates |= solved.estimate(fine, promising, 1)
+        estimates |= solved.estimate(fine, promising, 1, decided)
     kept = {key: estimates[key].factor for key in sorted(promising)}
     factors = {key: factor.astype(np.float32) for key, factor in kept.items() if factor is not None}
     longest = {name: longest[name] for name, _ in factors}
-    write_json(out / FILE, TextureTable(longest, [estimates[key].evidence for key in sorted(estimates)]))
+    evidence = [*rejected, *(estimate.evidence for estimate in estimates.values())]
+    write_json(out / FILE, TextureTable(longest, sorted(evidence, key=lambda each: (each.mesh, each.material))))
     if factors:
         write_factors(out / FACTORS, factors)
         (out / "photos").mkdir()
@@ -131,13 +145,20 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
         """Return the maps of a photo, with the normals and the detail of `surface`."""
         return read_geometry(self.inputs["align"], self.inputs.folders.get("surface"), name)
 
-    def estimate(self, fine: dict[str, SubdividedMesh], keys: set[Key] | None, step: int) -> dict[Key, Estimate]:
+    def estimate(
+        self,
+        fine: dict[str, SubdividedMesh],
+        keys: set[Key] | None,
+        step: int,
+        decided: Mapping[Key, float | None] = {},
+    ) -> dict[Key, Estimate]:
         """Return the texture of each mesh and material, and the evidence.
 
         Args:
             fine: Subdivided meshes.
             keys: Meshes and materials; None for all.
             step: Step between the used rows and columns of the photos.
+            decided: Stiffness of textures for which it is not chosen.
         """
 
         def observe(name: str) -> list[tuple[Key, TextureSamples]]:
@@ -155,7 +176,9 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
             self.report(f"texture of {name}")
             laplacian = mesh.laplacian()
             for key in sorted(key for key in observed if key[0] == name):
-                factor, decision, stiffness = select_texture(observed[key], laplacian)
+                stiffness = decided.get(key)
+                candidates = STIFFNESSES if stiffness is None else [stiffness]
+                factor, decision, stiffness = select_texture(observed[key], laplacian, candidates)
                 by = DetailEvidence.from_decision(decision, stiffness)
                 estimates[key] = Estimate(factor, TextureEvidence(*key, factor is not None, len(observed[key]), by))
         return estimates

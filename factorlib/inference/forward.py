@@ -22,16 +22,26 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from factorlib.images.tone import by_log_exponent
 from factorlib.inference.blocks import Block, RobustLoss
 from factorlib.inference.lights import Light, UnitLobes
 from factorlib.inference.materials import Materials
-from factorlib.inference.responses import CHUNK, ResponseLookup, Responses, diffuse_response, specular_response
+from factorlib.inference.responses import (
+    CHUNK,
+    ResponseLookup,
+    Responses,
+    apply_shadows,
+    diffuse_response,
+    lobe_cosines,
+    specular_response,
+)
 from factorlib.reflection.operator import Operator
 
-NORMAL_STEP = 0.02  # step of a normal for finite differences: about 1°
+NORMAL_STEP = 1e-3  # step of a normal, at which responses are linear and shadows are computed anew
 
 
 class Prediction(NamedTuple):
@@ -158,19 +168,49 @@ class Illumination(msgspec.Struct, frozen=True):
 
     def by_normal(self) -> Float[np.ndarray, "n 3 3"]:
         """Return ∂r/∂n of each observation, channel by axis, in the tangent plane of its normal."""
-        operated = msgspec.structs.replace(self, table=None)  # tables hold for the block's own normals
-        residual_before = operated.residuals()
-        normal = self.block.normal
-        # two tangents, and finite differences of the residuals along each
+        block = self.block
+        radiance = self.radiance()
+        # ∂r/∂ℓ; a satisfied bound has no residual
+        rising = block.inverse_sigma * self.light.tone_slope(radiance, block.photo)
+        rising = np.where(block.clipped & (radiance >= block.radiance), 0.0, rising)
+        linear = np.zeros((len(block), 3, 3))
+        for m, rows in material_slices(block):
+            linear[rows] = self._linear_by_normal(m, rows)
+        return rising[:, :, None] * linear
+
+    def _linear_by_normal(self, m: int, rows: slice) -> Float[np.ndarray, "n 3 3"]:
+        """Return ∂ℓ/∂n of the observations `rows`, of material m, by the operator's derivatives."""
+        block = self.block.take(np.arange(len(self.block))[rows])
+        every = slice(len(block))
+        lobes = self.light.unit_lobes
+        normal = block.normal
+        roughness = float(self.materials.roughness[m])
+        nz, oz, larger = lobe_cosines(block, every, lobes)
+        inputs = np.array(roughness), lobes.sharpness, (normal * block.view).sum(1), nz, oz
+        unit = self.operator.response(*(torch.as_tensor(values).to(self.operator.dtype) for values in inputs))
+
+        def reflect(normals: Float[np.ndarray, "n 3"], *responses: Tensor) -> Float[np.ndarray, "n 3"]:
+            """Return the part of ℓ that the light sends, with the shadows of other normals."""
+            turned = msgspec.structs.replace(block, normal=normals)
+            kd, ks = self.materials.diffuse[m] * self.detail[rows], self.materials.specular[m]
+            parts = zip((kd, ks), responses, (None, roughness), strict=True)
+            return self.exposure[rows] * sum(
+                k * ((larger * apply_shadows(part, turned, every, lobes, width).double().numpy()) @ self.light.weight)
+                for k, part, width in parts
+            )
+
+        before = reflect(normal, unit.diffuse, unit.specular)
         tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         result = np.zeros((len(normal), 3, 3))
-        for direction in (tangent, np.cross(normal, tangent)):
-            turned = normal + NORMAL_STEP * direction
-            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-            block = msgspec.structs.replace(self.block, normal=turned)
-            residual_after = msgspec.structs.replace(operated, block=block).residuals()
-            result += ((residual_after - residual_before) / NORMAL_STEP)[:, :, None] * direction[:, None, :]
+        for along in (tangent, np.cross(normal, tangent)):
+            # cosines are linear in n: the derivative of one along a tangent is the tangent's own
+            cosines = lobe_cosines(msgspec.structs.replace(block, normal=along), every, lobes)[0]
+            tz, to = map(torch.as_tensor, (cosines, (along * block.view).sum(1, keepdims=True)))
+            diffuse = unit.diffuse + NORMAL_STEP * unit.diffuse_by_nz * tz
+            specular = unit.specular + NORMAL_STEP * (unit.specular_by_nz * tz + unit.specular_by_no * to)
+            slope = (reflect(normal + NORMAL_STEP * along, diffuse, specular) - before) / NORMAL_STEP
+            result += slope[:, :, None] * along[:, None, :]
         return result
 
     def losses(self, loss: RobustLoss) -> Float[np.ndarray, " n"]:

@@ -23,7 +23,7 @@ Every step is a function of the previous state, and `FitRunner` saves each state
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import msgspec
 
@@ -45,6 +45,7 @@ from factorlib.inference.splitting import split_cells
 from factorlib.inference.start import Start, insert_known, refine_cells
 from factorlib.inference.suns import select_suns
 from factorlib.inference.uncertainty import Posterior
+from factorlib.results.materials import Decision, Model
 
 REFINED = FitSchedule(light_steps=2, descents=(0,), materials_fixed=True)
 MATERIALS = FitSchedule(descents=(5, 4))
@@ -85,7 +86,11 @@ class SolveRequest(msgspec.Struct, frozen=True):
 
 
 def solve(
-    problem: JointProblem, start: Start, options: SolveOptions = SolveOptions(), run: FitRunner | None = None
+    problem: JointProblem,
+    start: Start,
+    options: SolveOptions = SolveOptions(),
+    run: FitRunner | None = None,
+    decided: Model | None = None,
 ) -> Solution:
     """Solve the problem and return the answer, in the gauge of `factorlib.inference.gauge`.
 
@@ -94,12 +99,21 @@ def solve(
         start: Maker of the initial fits.
         options: Options of the user.
         run: Runner that saves states and reports events; None for one without a file.
+        decided: Choices of the solution that `start` continues, which are not made again; None to make them.
     """
     run = run or FitRunner()
+    if decided:
+        options = msgspec.structs.replace(options, splittings=0)
     request = SolveRequest(problem, initial_fits(problem, start, options), options, run)
-    state = run.run_steps(CHOICES, request, SolveState(request.starts[0], request.starts[0]))
+    state = SolveState(request.starts[0], request.starts[0])
+    if decided:
+        state = with_choices(state, decided, [block.name for block in problem.blocks])
+    else:
+        state = run.run_steps(CHOICES, request, state)
     request = msgspec.structs.replace(request, problem=problem.with_all_fitted())
-    state = run.run_steps(FITS, request, state)
+    state = run.run_steps(CONTINUED_FITS if decided else FITS, request, state)
+    if decided:
+        state = msgspec.structs.replace(state, splitting=decided.splitting_chosen_by)
     answer = fix_gauge(state.fit.point, state.effective_problem(problem).blocks, problem.known)
     point = Point(problem.known.insert_into(answer.materials), answer.lights)
     steps = {name: getattr(state, name) for name in SolveState.__struct_fields__}
@@ -111,6 +125,23 @@ def initial_fits(problem: JointProblem, start: Start, options: SolveOptions) -> 
     problem = reliable_observations(problem)
     fits = start(problem, min(TRIAL_CELLS, options.cells))
     return [msgspec.structs.replace(fit, point=insert_known(fit.point, problem)) for fit in fits]
+
+
+def with_choices(state: SolveState, model: Model, lights: Sequence[str]) -> SolveState:
+    """Return the state with the choices of an earlier solution for the lights of these names."""
+    by_light = {
+        "backgrounds": model.background_chosen_by,
+        "grounds": model.ground_chosen_by,
+        "tone": model.tone_chosen_by,
+        "distances": model.distance_chosen_by,
+        "suns": model.suns_chosen_by,
+    }
+    return msgspec.structs.replace(
+        state,
+        shadows=Decision(model.self_shadowing, **model.self_shadowing_chosen_by),
+        interreflection=Decision(model.interreflection, **model.interreflection_chosen_by),
+        **{name: [decisions[light] for light in lights if light in decisions] for name, decisions in by_light.items()},
+    )
 
 
 def choose_effects(request: SolveRequest, state: SolveState) -> SolveState:
@@ -205,3 +236,4 @@ FITS: Steps = {
     "lights": fit_lights,
     "suns": choose_suns,
 }
+CONTINUED_FITS: Steps = {name: FITS[name] for name in ("materials", "prior", "lights")}

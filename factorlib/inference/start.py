@@ -46,6 +46,7 @@ SPECULAR_SHARE = 0.2
 # With at most FEW_MATERIALS materials, a solve starts from each roughness of START_ROUGHNESSES.
 FEW_MATERIALS = 2
 START_ROUGHNESSES = (0.15, 0.4, 0.8)
+COMPARED = 1000  # observations by which an earlier light is compared with a constant one
 LEAST_RADIANCE = 1e-6  # least radiance, as a share of a block's mean
 
 # Function of a problem and a number of cells a light; the best of its fits continues.
@@ -345,8 +346,9 @@ def light_from_earlier(constant: Illumination, earlier: EarlierSolution, factor:
         np.log(np.clip(tone, *TONE_RANGE)) if len(tone) == len(block.photos) else np.zeros(0),
         model.curvature(block.name),
     )
-    illumination = msgspec.structs.replace(constant, light=light)
-    if illumination.losses(COMPARISON_LOSS).mean() <= constant.losses(COMPARISON_LOSS).mean():
+    sample = msgspec.structs.replace(constant, block=block.subsample(COMPARED, seed=0))
+    losses = [msgspec.structs.replace(sample, light=each).losses(COMPARISON_LOSS) for each in (light, constant.light)]
+    if losses[0].mean() <= losses[1].mean():
         return light
     message = "illumination '%s' starts anew: a constant light explains its photos better than the earlier solution's"
     log.warning(message, block.name)

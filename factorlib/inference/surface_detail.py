@@ -1,29 +1,33 @@
 """Surface detail: normals and albedo factors, chosen with their stiffness by held-out photos.
 
 start       Materials and lights are fitted on few cells, with the shadows and interreflection of the given meshes.
-            Lights are infinitely far away: near lights absorb what turns of wrong normals should explain (rough set of
-            seed 0: 3.5 instead of 3.1 degrees).
-stiffness   For each of `TURN_STIFFNESSES`, from stiff to soft, and for every fold, turns are estimated from all photos
-            outside the fold.  A photo of the fold then gets its own light, with the materials given.  The stiffness
-            with the largest marginal likelihood of the photos is used (`factorlib.inference.likelihood`); the search
-            ends where that falls.  Every light has its own cells (`factorlib.inference.start`): with common cells,
-            normals could turn toward the cells' centres in all photos at once.
-decision    Turns are kept if the photos' log Bayes factor, summed, exceeds `VERY_STRONG`.  The held-out observations of
-            six photos are too few: they refused turns with log Bayes factors of 100 to 317, by which relit pictures
-            gain 1.0 and 3.4 dB (data/eames, captured set of seed 128).  Exact surfaces have negative ones.  Of several
-            meshes, one stays as it is if the log Bayes factor of its turns alone does not exceed that.
+            Lights are then fitted on `CELLS` cells: with fewer, turned normals explain what cells blur, and exact
+            surfaces in sharp lights were moved (log Bayes factors of 34 and 145, now -15 and -243).  Lights are
+            infinitely far away: near lights absorb what turns of wrong normals should explain (rough set of seed 0: 3.5
+            instead of 3.1 degrees).
+stiffness   Lights are linearised once, on the mesh itself.  For each of `TURN_STIFFNESSES`, from stiff to soft, and for
+            every fold, turns are estimated from all photos outside the fold.  The linearised model gives the likelihood
+            of a photo of the fold in a light of its own (`LightTerms.change`).  The stiffness with the largest one is
+            used; the search ends where it falls.  Every light has its own cells (`factorlib.inference.start`): with
+            common cells, normals could turn toward the cells' centres in all photos at once.  Of several meshes, one
+            stays as it is if the log Bayes factor of its turns alone does not exceed `VERY_STRONG`.
+decision    The light of each photo is fitted anew to the selected turns.  They are kept if the photos' log Bayes
+            factor, summed, exceeds `VERY_STRONG`.  The held-out observations of six photos are too few: they refused
+            turns with log Bayes factors of 100 to 317, by which relit pictures gain 1.0 and 3.4 dB (data/eames,
+            captured set of seed 128).  Exact surfaces have negative ones.
 paint       Factors on the diffuse reflectance are chosen likewise, with a stiffness of `FACTOR_STIFFNESSES`, in
             addition to the turns.  They are kept if the likelihood is higher by more than `CLEARLY_FOR` standard errors
             over photos and held-out observations are explained better.
 nodes       Only nodes that two photos or more show turn.
-rounds      Turns are estimated from all lights, and materials and lights are fitted again, `ROUNDS` times.
-surface     The result is the displacement whose normals are nearest to the turned ones.  It excludes turns that no
-            displacement explains: a wrong pose turns all normals of a photo.
+surface     The chosen detail is estimated from all photos.  The result is the displacement whose normals are nearest to
+            the turned ones.  It excludes turns that no displacement explains: a wrong pose turns all normals of a
+            photo.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from itertools import count
 from typing import NamedTuple
 
@@ -32,11 +36,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
-from factorlib.inference.fit import Fit, FitSchedule, fit_problem, light_likelihood, reliable_observations
+from factorlib.inference.fit import Fit, FitSchedule, light_likelihood, reliable_observations
 from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
-    CLEARLY_AGAINST,
+    BACKGROUND_SCHEDULE,
     CLEARLY_FOR,
     TRIAL,
     TRIAL_CELLS,
@@ -67,12 +71,10 @@ from factorlib.results.materials import Decision
 # Stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it.
 TURN_STIFFNESSES = (1000.0, 300.0, 100.0, 30.0, 10.0)
 FACTOR_STIFFNESSES = (300.0, 100.0, 30.0, 10.0)  # stiffness of log factors
-ROUNDS = 3
-CELLS = 250  # cells of a light
+CELLS = 250  # cells of a light, given the materials
+LIGHTS_SCHEDULE = FitSchedule(light_steps=2, descents=(2,), materials_fixed=True)
 FOLDS = 4  # folds of photos
-OBSERVATIONS = 1000  # fitted observations of a light, or of a held-out photo
-START_SCHEDULE = FitSchedule(light_steps=2, descents=(3, 2), estimate_first=False)
-ROUND_SCHEDULE = FitSchedule(descents=(2,), estimate_first=False)
+OBSERVATIONS = 600  # fitted observations of a light, or of a held-out photo
 LIGHT_STEPS = 2  # factorisations in the fit of a held-out photo's light
 
 
@@ -257,9 +259,8 @@ class DetailTrial(msgspec.Struct, frozen=True):
                 np.isin(block.photo, [j for n, j in photos[fold::folds] if n == k])
                 for k, block in enumerate(self.problem.blocks)
             ]
-            pairs = zip(parts, left_out, strict=True)
+            pairs = [(part, rows) for part, rows in zip(parts, left_out, strict=True) if not rows.all()]
             used = [part.drop_observations(rows) if rows.any() else part for part, rows in pairs]
-            used = [part for part in used if len(part.residual)]
             detail = solve_detail(used, laplacian, stiffness, zero_detail(self.surfaces.nodes), movable)
             positions = [positions.take(~rows) for positions, rows in zip(self.attached, left_out, strict=True)]
             # only turns that a displacement explains
@@ -272,22 +273,20 @@ class DetailTrial(msgspec.Struct, frozen=True):
 
 
 class StiffnessChoice(NamedTuple):
-    """Result of a search for the likeliest stiffness.
+    """Likeliest stiffness of a detail, and the photos' scores by it.
 
     Attributes:
         stiffness: Stiffness.
-        details: Detail for each photo, estimated from other photos.
         scores: Scores of the photos.
         evidence: Decision on the detail.
     """
 
     stiffness: Stiffness
-    details: list[Detail]
     scores: PhotoScores
     evidence: Decision
 
 
-class DetailSearch(msgspec.Struct, frozen=True):
+class DetailSearch(msgspec.Struct, frozen=True, dict=True):
     """Search for the surface detail of a trial.
 
     Attributes:
@@ -304,81 +303,53 @@ class DetailSearch(msgspec.Struct, frozen=True):
     plain: PhotoScores
     tick: Tick
 
-    def select_stiffness(
-        self,
-        candidates: Sequence[Stiffness],
-        reference: PhotoScores,
-        decide: Callable[[PhotoScores, PhotoScores], Decision],
-        movable: Bool[np.ndarray, " v"],
-    ) -> StiffnessChoice:
-        """Select the stiffness of the detail with the largest marginal likelihood of the photos.
+    @cached_property
+    def photo_terms(self) -> list[LightTerms]:
+        """Terms of each photo by itself, in a light of its own."""
+        parts = [(self.parts[k], self.trial.problem.blocks[k].photo != j) for k, j in self.trial.photos]
+        return [part.drop_observations(others) if others.any() else part for part, others in parts]
 
-        The search goes from stiff to soft.  It ends at a stiffness that is less likely than the previous one, or
-        with clear evidence against the detail.
+    def select_stiffness(
+        self, candidates: Sequence[Stiffness], movable: Bool[np.ndarray, " v"]
+    ) -> tuple[Stiffness, list[Detail]]:
+        """Select the stiffness of the detail by which left-out photos are likeliest; return it with the details.
+
+        Likelihoods are those of the linearised model.  The search goes from stiff to soft.  It ends at a stiffness that
+        is less likely than the previous one.
 
         Args:
             candidates: Stiffnesses, from stiff to soft.
-            reference: Scores without this detail.
-            decide: Decision on scores with the detail and without it.
             movable: Mask of the nodes whose normals may turn.
         """
-        best: StiffnessChoice | None = None
+        choices = []
+        values = [np.inf]
         for stiffness in candidates:
             details = self.trial.fit_folds(self.parts, self.laplacian, stiffness, movable, self.tick)
-            scores = self.trial.score_photos(details, self.tick, self.plain)
-            if best is not None and round(float(scores.values.sum() - best.scores.values.sum()), 3) >= 0:
+            values.append(round(self.change(details), 3))
+            if values[-1] >= values[-2]:
                 break
-            best = StiffnessChoice(stiffness, details, scores, decide(scores, reference))
-            if scores.gain_over(reference) < CLEARLY_AGAINST:
-                break
-        assert best is not None
-        return best
+            choices.append((stiffness, details))
+        return choices[-1]
+
+    def change(self, details: Sequence[Detail]) -> float:
+        """Return the change of −2 log likelihood of all photos by the detail for each, in the linearised model."""
+        return sum(terms.change(detail) for terms, detail in zip(self.photo_terms, details, strict=True))
 
     def select_turns(self) -> tuple[StiffnessChoice, set[str]]:
         """Choose the stiffness of turned normals; return it with the meshes whose turns improve held-out photos."""
-        candidates = [Stiffness(a) for a in TURN_STIFFNESSES]
-        turned = self.select_stiffness(candidates, self.plain, decide_turns, self.trial.shared_nodes)
-        movable = self.select_meshes(turned.details) if turned.evidence.accepted else set()
-        if 0 < len(movable) < len(self.trial.surfaces.meshes):
-            scores = self.trial.score_photos(
-                [self.trial.restrict_turns(detail, movable) for detail in turned.details], self.tick, self.plain
-            )
-            turned = turned._replace(scores=scores, evidence=decide_turns(scores, self.plain))
-        return turned, movable
-
-    def fit_all_photos(self, stiffness: Stiffness, movable: set[str], pieces: ProgressSections, seed: int) -> Detail:
-        """Return the detail from all photos, with materials and lights fitted again between its steps.
-
-        Args:
-            stiffness: Stiffness of the detail.
-            movable: Meshes whose normals may turn.
-            pieces: Progress report, divided into sections.
-            seed: Seed of the drawn observations.
-        """
         trial = self.trial
-        parts = self.parts
-        fit = self.trial.fit
-        nodes = trial.surfaces.node_mask(movable) & trial.shared_nodes
-        detail = zero_detail(trial.surfaces.nodes)
-        for number in range(ROUNDS):
-            begin = 0.85 + 0.05 * number
-            tick = pieces.section(begin, begin + 0.05, ROUND_SCHEDULE.points, f"all photos, round {number + 1}")
-            if number:
-                fit = fit_problem(
-                    trial.with_detail(detail).subsample(OBSERVATIONS, seed), fit, trial.prior, ROUND_SCHEDULE, tick
-                )
-                parts = trial.linearise(detail, fit)
-            detail = solve_detail(parts, self.laplacian, stiffness, detail, nodes)
-        return detail
-
-    def select_meshes(self, turned: Sequence[Detail]) -> set[str]:
-        """Return the meshes whose turns alone, without those of other meshes, improve held-out photos."""
-        names = self.trial.surfaces.meshes
-        if len(names) == 1:
-            return set(names)
-        restricted = [(name, [self.trial.restrict_turns(detail, {name}) for detail in turned]) for name in names]
-        scores = {name: self.trial.score_photos(details, self.tick, self.plain) for name, details in restricted}
-        return {name for name, mesh_scores in scores.items() if decide_turns(mesh_scores, self.plain).accepted}
+        stiffness, details = self.select_stiffness([Stiffness(a) for a in TURN_STIFFNESSES], trial.shared_nodes)
+        # meshes whose turns alone, without those of other meshes, improve held-out photos
+        alone = {name: [trial.restrict_turns(detail, {name}) for detail in details] for name in trial.surfaces.meshes}
+        movable = {name for name, restricted in alone.items() if self.change(restricted) < -2 * VERY_STRONG}
+        if not movable:
+            return StiffnessChoice(
+                stiffness, self.plain, Decision(False, log_bayes_factor=-self.change(details) / 2)
+            ), movable
+        scores = trial.score_photos(
+            [trial.restrict_turns(detail, movable) for detail in details], self.tick, self.plain
+        )
+        return StiffnessChoice(stiffness, scores, decide_turns(scores, self.plain)), movable
 
 
 def estimate_surface(
@@ -399,27 +370,27 @@ def estimate_surface(
         seed: Seed of the drawn observations.
         report: Called with the completed share and the current activity.
     """
-    pieces = ProgressSections(report)
     plain = zero_detail(surfaces.nodes)
-    tick = pieces.section(0.0, 0.3, TRIAL.points + START_SCHEDULE.points, "materials and lights")
+    tick = section(report, 0.0, 0.5, TRIAL.points + BACKGROUND_SCHEDULE.points, "materials and lights")
     trial, initial = fit_trial(problem, start, seed, (surfaces, attached), tick)
     photos = len(trial.photos)
     if photos < 2 or problem.none_held_out:
         return SurfaceEstimate(initial, Decision(False))
-    tick = pieces.section(0.3, 0.85, 4 * len(TURN_STIFFNESSES) * photos, "left-out photos")
+    tick = section(report, 0.5, 0.95, 4 * len(TURN_STIFFNESSES) + 3 * photos, "left-out photos")
     scores = trial.score_photos([plain] * photos, tick)
     search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), scores, tick)
     turned, movable = search.select_turns()
-    unturned = StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
-    selected = turned if turned.evidence.accepted else unturned
+    selected = turned if turned.evidence.accepted else StiffnessChoice(Stiffness(None), scores, turned.evidence)
     candidates = [Stiffness(selected.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
     nodes = trial.shared_nodes & surfaces.node_mask(movable)
-    painted = search.select_stiffness(candidates, selected.scores, decide_paint, nodes)
+    stiffness, details = search.select_stiffness(candidates, nodes)
+    with_paint = trial.score_photos(details, tick)
+    painted = StiffnessChoice(stiffness, with_paint, decide_paint(with_paint, selected.scores))
     selected = painted if painted.evidence.accepted else selected
     if not (turned.evidence.accepted or painted.evidence.accepted):
         return SurfaceEstimate(initial, turned.evidence, painted.evidence)
     gains = dict(zip(trial.names, (scores.values - selected.scores.values).tolist(), strict=True))
-    detail = search.fit_all_photos(selected.stiffness, movable, pieces, seed)
+    detail = solve_detail(search.parts, search.laplacian, selected.stiffness, plain, nodes)
     displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.accepted else {}
     displacements = {name: displacement for name, displacement in displacements.items() if name in movable}
     factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.accepted else {}
@@ -443,31 +414,27 @@ def fit_trial(
     """
     run = FitRunner(report=lambda event: tick())
     reliable = reliable_observations(problem)
-    choices = SolveOptions(self_shadowing="on", interreflection="on", seed=seed)
+    choices = SolveOptions(self_shadowing="on", interreflection="on", observations=OBSERVATIONS, seed=seed)
     effects = select_effects(reliable, start(reliable, TRIAL_CELLS), choices, run)
     lit = reliable.with_effects(effects.shadows.accepted, effects.interreflection.accepted)
     selection = select_backgrounds(lit, effects.fit, choices, run)
     effects = effects.with_fit(selection.fit, backgrounds=selection.evidence)
     problem = effects.effective_problem(problem)
-    start_fit = refine_cells(effects.fit, CELLS, problem)
-    fit = run.fit("surface", problem.subsample(OBSERVATIONS, seed), start_fit, START_SCHEDULE)
+    finer = refine_cells(effects.fit, CELLS, problem)
+    fit = run.fit("surface", problem.subsample(OBSERVATIONS, seed), finer, LIGHTS_SCHEDULE)
     return DetailTrial(problem, fit, *surface, run.prior), InitialFit.from_fit(effects.fit, problem.blocks)
 
 
-class ProgressSections(msgspec.Struct, frozen=True):
-    """Progress report of a search, divided into sections of equal units of work."""
+def section(report: ProgressReport, begin: float, end: float, number: int, activity: str) -> Tick:
+    """Return a function that reports one more completed unit of work at each call.
 
-    report: ProgressReport
-
-    def section(self, begin: float, end: float, number: int, activity: str) -> Tick:
-        """Return a function that reports one more completed unit of work at each call.
-
-        Args:
-            begin: Share that is complete before.
-            end: Share that is complete afterwards.
-            number: Number of units.
-            activity: Activity.
-        """
-        self.report(begin, activity)
-        completed = count(1)
-        return lambda *_: self.report(begin + (end - begin) * min(next(completed) / number, 1.0), activity)
+    Args:
+        report: Called with the completed share and the activity.
+        begin: Share that is complete before.
+        end: Share that is complete afterwards.
+        number: Number of units.
+        activity: Activity.
+    """
+    report(begin, activity)
+    completed = count(1)
+    return lambda *_: report(begin + (end - begin) * min(next(completed) / number, 1.0), activity)

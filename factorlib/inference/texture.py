@@ -130,13 +130,14 @@ def solve_texture(
 
 
 def select_texture(
-    samples: Sequence[TextureSamples], laplacian: csr_array
+    samples: Sequence[TextureSamples], laplacian: csr_array, stiffnesses: Sequence[float] = STIFFNESSES
 ) -> tuple[Float[np.ndarray, "v 3"] | None, Decision, float]:
     """Return the texture if photos are predicted better by it, with the evidence and the stiffness.
 
     Args:
         samples: Pixels of each photo.
         laplacian: Laplacian of the mesh.
+        stiffnesses: Candidates for the stiffness, from stiff to soft.
     """
     folds = min(FOLDS, len(samples))
     seen = np.array([sample.operator.T @ sample.weight for sample in samples])
@@ -147,14 +148,14 @@ def select_texture(
         shared.append(np.flatnonzero((sample.operator @ elsewhere > LEAST_SHARED) & (sample.weight > 0)))
     predicted = [k for k, rows in enumerate(shared) if len(rows)]
     if len(samples) < 2 or not predicted:
-        return None, Decision(False), STIFFNESSES[0]
+        return None, Decision(False), stiffnesses[0]
     clusters = [np.unique(samples[k].cluster[shared[k]], return_inverse=True)[1] for k in predicted]
     others = [[sample for number, sample in enumerate(samples) if number % folds != fold] for fold in range(folds)]
     colours = [flat_colour(other) for other in others]
     flat = Losses([samples[k].losses(colours[k % folds], shared[k]) for k in predicted], clusters)
     best: tuple[Decision, float] | None = None
     textures = [np.tile(colour, (laplacian.shape[0], 1)) for colour in colours]
-    for stiffness in STIFFNESSES:
+    for stiffness in stiffnesses:
         pairs = zip(others, textures, strict=True)
         textures = [solve_texture(other, laplacian, stiffness, texture) for other, texture in pairs]
         losses = [samples[k].losses(samples[k].operator @ textures[k % folds], shared[k]) for k in predicted]

@@ -9,28 +9,31 @@ from scipy.linalg import block_diag
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.inference import forward, surface_turns
+from factorlib.inference import surface_turns
 from factorlib.inference.blocks import FIT_LOSS
-from factorlib.inference.fit import Hyperparameters, light_likelihood
+from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_problem, light_likelihood
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
-from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
+from factorlib.inference.surface_detail import DetailTrial, SurfaceEstimate, estimate_surface
 from factorlib.inference.surface_turns import (
     LARGEST_TURN,
     LEAST_VIEW_COSINE,
     PULL_SHARE,
     Detail,
+    LightTerms,
     Stiffness,
     SurfacePositions,
     Surfaces,
     attach_pixels,
     linearise_light,
     solve_detail,
+    zero_detail,
 )
 from factorlib.meshes import subdivision
 from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
+from factorlib.reflection import reflection_operator
 from factorlib.results.poses import ObjectPose, pose_fields
 from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
@@ -76,8 +79,7 @@ def with_wrong_normals(problem: JointProblem, size: float) -> JointProblem:
 
 
 @pytest.mark.parametrize("kind", ["clipped", "bounced", "hidden"])
-def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
-    monkeypatch.setattr(forward, "NORMAL_STEP", 1e-3)  # the step in use smooths what is sharper than a degree
+def test_slopes_are_those_of_the_forward_model(kind):
     one, body = photos_in_a_wrong_light(kind), surfaces()
     at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
     turn, log_factor = random.normal(size=(2, body.nodes, 3))
@@ -95,6 +97,47 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
     assert np.abs(expected).max() > 1  # there is something to compare
     error = np.linalg.norm((given - expected)[inside]) / np.linalg.norm(expected[inside])
     assert error < 0.03, error
+
+
+def test_slopes_by_compiled_derivatives_are_finite_differences():
+    one = photos_in_a_wrong_light("hidden")
+    own = msgspec.structs.replace(one, operator=reflection_operator("network"))
+    exact = msgspec.structs.replace(one, operator=reflection_operator("network", dtype="float64"))
+    normal, step = one.block.normal, 1e-4
+    sides = np.cross(normal, [0.6, 0.0, 0.8])
+    turned = [msgspec.structs.replace(one.block, normal=normal + s * sides) for s in (step, -step)]
+    after, before = (msgspec.structs.replace(exact, block=block).residuals() for block in turned)
+    inside = np.sum(normal * one.block.view, 1) > 0.2
+    expected, given = (after - before) / (2 * step), np.einsum("ncx,nx->nc", own.by_normal(), sides)
+    assert np.linalg.norm((given - expected)[inside]) < 0.02 * np.linalg.norm(expected[inside])
+
+
+def dented(size: float) -> tuple[DetailTrial, list[LightTerms]]:
+    """A ball whose mesh has dents, in three lights that are at their optimum, and the lights linearised on the mesh."""
+    problem, body = spheres([on_even_cells(drawn(100 + k, 120)) for k in range(3)], size=13, seed=1), surfaces()
+    given = with_wrong_normals(problem, size).with_all_fitted()
+    start, schedule = begun(given), FitSchedule(light_steps=20, materials_fixed=True)
+    fit = fit_problem(given, start, PRIOR, schedule)
+    at = [attached_to(block.normal, body) for block in problem.blocks]
+    trial = DetailTrial(given, fit, body, at, PRIOR)
+    return trial, trial.linearise(zero_detail(body.nodes), fit)
+
+
+def test_the_change_by_a_small_detail_is_that_of_lights_fitted_anew():
+    trial, parts = dented(0.05)
+    nodes, random = trial.surfaces.nodes, np.random.default_rng(2)
+    detail = Detail(*(3e-3 * random.normal(size=(2, nodes, 3))))
+    again = fit_problem(trial.with_detail(detail), trial.fit, PRIOR, FitSchedule(light_steps=20, materials_fixed=True))
+
+    def least(problem: JointProblem, fit: Fit) -> list[float]:
+        """The minimum of φ of each light, without determinants."""
+        pairs = zip(problem.illuminations(fit.point), fit.hyperparameters, strict=True)
+        return [light_likelihood(*pair, PRIOR, True).gradient().value for pair in pairs]
+
+    expected = np.subtract(least(trial.with_detail(detail), again), least(trial.problem, trial.fit))
+    given = [part.change(detail) for part in parts]
+    assert np.abs(expected).max() > 0.2
+    np.testing.assert_allclose(given, expected, atol=0.08 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])

@@ -45,8 +45,9 @@ def painted(tmp_path_factory):
 def exchanged(monkeypatch, tmp_path, inputs: Inputs, solution) -> Inputs:
     """The inputs of the stages after an exchange whose solve gives a solution that is known."""
 
-    def solve(params, given, out, progress):
-        """Copy the solution; the surface that it is given has the paint."""
+    def solve(params, given, out, progress, decided):
+        """Copy the solution; it continues the earlier one, and the surface that it is given has the paint."""
+        assert decided and given["start"] == inputs["solve"]
         logging.getLogger("factorlib.inference").warning("of this solution")
         for name in TURNS:
             surface, paint = (read_exr(given[s] / "photos" / f"{name}.exr") for s in ("surface", "texture"))
