@@ -15,7 +15,13 @@ from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_probl
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
-from factorlib.inference.surface_detail import DetailTrial, SurfaceEstimate, estimate_surface
+from factorlib.inference.surface_detail import (
+    TURN_STIFFNESSES,
+    DetailSearch,
+    DetailTrial,
+    SurfaceEstimate,
+    estimate_surface,
+)
 from factorlib.inference.surface_turns import (
     LARGEST_TURN,
     LEAST_VIEW_COSINE,
@@ -138,6 +144,21 @@ def test_the_change_by_a_small_detail_is_that_of_lights_fitted_anew():
     given = [part.change(detail) for part in parts]
     assert np.abs(expected).max() > 0.2
     np.testing.assert_allclose(given, expected, atol=0.08 * np.abs(expected).max())
+
+
+@pytest.mark.long
+def test_the_stiffness_by_linearised_lights_gains_most_of_what_the_likeliest_by_lights_fitted_anew_does():
+    trial, parts = dented(0.15)
+    plain = trial.score_photos([zero_detail(trial.surfaces.nodes)] * len(trial.photos))
+    search = DetailSearch(trial, parts, trial.surfaces.laplacian(), plain, lambda: None)
+    candidates = [Stiffness(a) for a in TURN_STIFFNESSES]
+    nodes = trial.shared_nodes
+    gains = {}
+    for stiffness in candidates:
+        details = trial.fit_folds(parts, search.laplacian, stiffness, nodes, lambda: None)
+        gains[stiffness.turn] = float((plain.values - trial.score_photos(details).values).sum())
+    chosen, _ = search.select_stiffness(candidates, nodes)
+    assert gains[chosen.turn] > 0.7 * max(gains.values()) > 10, (chosen, gains)
 
 
 @pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])
