@@ -2,8 +2,8 @@
 
 `texture` estimates paint in lights that were estimated without it, so lights and specular parts explain some of the
 paint.  Where a texture is kept, the solve continues with the textures as detail of the surface and with its choices of
-the model.  The photos are shaded in these lights, and the kept textures are estimated again with their stiffness.  The
-exchange is kept if the textures then predict photos better that they were not estimated from.
+the model.  The photos are shaded in these lights, and the kept textures are estimated again, no softer.  The exchange
+is kept if the textures then predict photos better that they were not estimated from.
 
 Writes exchange.json.  If the exchange is kept, the folders `solve`, `shading` and `texture` are new results of these
 stages, which replace theirs (`factorlib.results.exchange`).
@@ -82,7 +82,7 @@ def held_back() -> Iterator[list[logging.LogRecord]]:
 def solve_again(params: Params, inputs: Inputs, out: Path, progress: Progress, before: TextureTable) -> None:
     """Solve with the textures as detail of the surface, shade in the new lights, and estimate the textures again.
 
-    The choices of the solve, and the kept textures with their stiffness, are those of before.
+    The choices of the solve stay, and the kept textures become no softer.
     """
     for name in REPLACED:
         (out / name).mkdir()

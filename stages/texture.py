@@ -74,7 +74,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress, before: 
         inputs: Inputs of the stage.
         out: Folder to write to.
         progress: Called with the completed work, its total and the current activity.
-        before: Earlier result, whose kept textures alone are estimated again, with their stiffness; None to choose.
+        before: Earlier result, whose kept textures alone are estimated again, no softer; None to choose.
     """
     names = inputs.facts["dataset.materials"]
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
@@ -158,7 +158,7 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
             fine: Subdivided meshes.
             keys: Meshes and materials; None for all.
             step: Step between the used rows and columns of the photos.
-            decided: Stiffness of textures for which it is not chosen.
+            decided: Least stiffness of each texture; 0 for others.
         """
 
         def observe(name: str) -> list[tuple[Key, TextureSamples]]:
@@ -176,8 +176,8 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
             self.report(f"texture of {name}")
             laplacian = mesh.laplacian()
             for key in sorted(key for key in observed if key[0] == name):
-                stiffness = decided.get(key)
-                candidates = STIFFNESSES if stiffness is None else [stiffness]
+                # from stiff to soft, so that the same lights give the same texture as before
+                candidates = [a for a in STIFFNESSES if a >= (decided.get(key) or 0)]
                 factor, decision, stiffness = select_texture(observed[key], laplacian, candidates)
                 by = DetailEvidence.from_decision(decision, stiffness)
                 estimates[key] = Estimate(factor, TextureEvidence(*key, factor is not None, len(observed[key]), by))
