@@ -10,8 +10,7 @@ Data     blocks (observations by illumination, noise model, robust losses), obse
 Model    forward (radiance and derivatives), responses (reflection of cells), interreflection, problem (any point)
 Fit      material_prior, likelihood (the objective), optimizer, exposures (their balance against reflectances), fit
          (hyperparameters), start (initial values)
-Method   joint_solver (its steps), fit_runner (states and events), model_selection, score_test, splitting, suns;
-         options, known
+Method   joint_solver (its steps), fit_runner (states and events), model_selection, splitting, suns; options, known
 Surface  surface_detail (the choice), surface_turns (normals from shading)
 Results  uncertainty, material_posterior (prior against errors of the model), gauge, identifiability, misfit, answer,
          held_out_photos

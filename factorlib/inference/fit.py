@@ -36,7 +36,7 @@ from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
 from factorlib.inference.material_prior import MaterialPrior, material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.optimizer import Descent, DescentState, LossReport
+from factorlib.inference.optimizer import Descent, LossReport
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.responses import ResponseCache
 from factorlib.light.prior import LightPrior
@@ -162,23 +162,6 @@ def fit_problem(
         light_values = [system.value for system in state.systems]
     value = sum(light_values) + state.prior.value
     return Fit(Point(materials, [each.light for each in state.likelihoods]), hyperparameters, value, light_values, True)
-
-
-def linearise_fit(problem: JointProblem, fit: Fit, prior: LightPrior) -> tuple[Descent, DescentState]:
-    """Return the normal equations of all lights at a fit, and the descent that they belong to.
-
-    Args:
-        problem: Observations and model, none of them held out.
-        fit: Fit.
-        prior: Prior on lights.
-    """
-    materials = fit.point.materials
-    material_prior = MaterialPrior(materials, problem.blocks, problem.known)
-    descent = Descent(material_prior, problem.spread, lambda loss: None, problem.known.free(len(materials)))
-    pairs = zip(problem.illuminations(fit.point), fit.hyperparameters, strict=True)
-    with_table = partial(light_likelihood, prior=prior, tables=problem.tables)
-    likelihoods = list(problem.spread(lambda pair: with_table(*pair), list(pairs)))
-    return descent, descent.linearise(likelihoods, material_unknowns(materials))
 
 
 def light_likelihood(

@@ -10,16 +10,13 @@ tone        Exponents of tone curves are freed for all photos, at first for one 
             three conditions: the evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher,
             and they end within the range of real cameras.  An exponent also fits some errors of the rest of the model,
             such as wrong normals.
-distance    The marginal likelihoods of a light at infinity and at a finite distance decide.  They use all fitted
+distance    The marginal likelihoods of a light at infinity and at `CURVATURES` decide.  They use all fitted
             observations; the few that are held out decide differently from draw to draw.
 ground      The shadows on the ground are observations of a light if they lie where the light that the objects tell of
             casts them.  A cut-out or a picture of a floor has none, and a wrong plane has others.
 roughness   With few materials, the start decides which local minimum a fit reaches: a smooth surface in soft light
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
-
-Most effects are not there.  Distances are therefore fitted only if a score test predicts a log Bayes factor of
-`PLAUSIBLE` (`factorlib.inference.score_test`), tone curves only if one step gains half of what they need.
 
 Models that are compared are fitted from one start with the same number of steps: one that got more descent would seem
 better.  Shadows and tone curves compare two models that are fitted to the same observations with reliable normals, by
@@ -47,16 +44,14 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import ndtr, ndtri, stdtr
+from scipy.special import ndtr, ndtri, softmax, stdtr
 
 from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
 from factorlib.inference.fit_runner import FitRunner, SolveState
-from factorlib.inference.forward import Illumination
 from factorlib.inference.materials import Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.score_test import ScoreTest
 from factorlib.results.materials import Decision
 
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
@@ -80,11 +75,9 @@ TONE_SCHEDULE = FitSchedule(descents=(8,), estimate_first=False)
 # (margin 3.0, captured set of seed 7), and k_d was 30 % wrong instead of 13 %.
 LEAST_TONE_GAIN = 0.25
 VERY_STRONG = 5.0  # log Bayes factor of very strong evidence (Kass and Raftery 1995)
-PLAUSIBLE = VERY_STRONG / 2  # predicted log Bayes factor below which an effect is not fitted
-# Curvatures of lights 20 and 5 RMS distances away, the step of the score test and the largest.  A chair's points are
-# 0.4 m from their centre, and a room's walls and lamps 2 to 8 m.
-CURVATURE_STEP = 0.05
-LARGEST_CURVATURE = 0.2
+# Curvatures of lights 20, 10 and 5 RMS distances away.  A chair's points are 0.4 m from their centre, and a room's
+# walls and lamps 2 to 8 m.
+CURVATURES = (0.05, 0.1, 0.2)
 DISTANCE_SCHEDULE = FitSchedule(light_steps=2, descents=(2,), estimate_first=False)
 LIGHTS_ONLY = FitSchedule(light_steps=3, materials_fixed=True)
 TEMPERED_LIGHTS = FitSchedule(descents=(0, 3), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
@@ -367,9 +360,9 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
 def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, run: FitRunner) -> Selection:
     """Choose distances of lights by their marginal likelihoods.
 
-    A score test predicts the curvature of each light.  Materials adapt to the distances at which they are fitted.
-    Each light that may be near is therefore compared twice: with materials and lights fitted at infinity and at the
-    predicted curvatures, and with the materials of the near lights.  The smaller Bayes factor counts.
+    Materials adapt to the distances at which they are fitted.  Each light is therefore compared twice: with materials
+    and lights fitted at infinity and at each of `CURVATURES`, and, if that favours a near light, with the materials of
+    the near lights.  The smaller Bayes factor counts.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
@@ -384,18 +377,6 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         return Selection(before, evidence)
     sample = comparison_sample(problem, options)
 
-    def approach(illumination: Illumination, curvature: float) -> Illumination:
-        """Return the illumination with its light at a finite distance."""
-        light = msgspec.structs.replace(illumination.light, curvature=curvature)
-        return msgspec.structs.replace(illumination, light=light, table=None)
-
-    predicted = ScoreTest(sample, before, run.prior).of_each_light(approach, CURVATURE_STEP, LARGEST_CURVATURE)
-    for k in candidates:
-        evidence[k] = Decision(False, log_bayes_factor=predicted[k].log_bayes_factor)
-    near = {k: predicted[k].size for k in candidates if predicted[k].log_bayes_factor > PLAUSIBLE}
-    if not near:
-        return Selection(before, evidence)
-
     def fit_with_curvatures(
         curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE
     ) -> Fit:
@@ -404,15 +385,21 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         lights = [msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature)) for k, light in pairs]
         return run.fit("distances", sample, start.with_lights(lights), schedule)
 
-    far = dict.fromkeys(near, 0.0)
-    far_fit, near_fit = (fit_with_curvatures(curvatures) for curvatures in (far, near))
-    given_materials = [fit_with_curvatures(curvatures, near_fit, LIGHTS_ONLY) for curvatures in (far, near)]
-    values = np.array([fit.light_values for fit in (far_fit, near_fit, *given_materials)])
-    factor = np.minimum(values[0] - values[1], values[2] - values[3]) / 2
-    for k in near:
+    values = np.array([fit_with_curvatures(dict.fromkeys(candidates, c)).light_values for c in (0.0, *CURVATURES)])
+    log_bayes_factors = (values[0] - values[1:]) / 2
+    likely = softmax(log_bayes_factors, axis=0).T @ CURVATURES
+    factor = log_bayes_factors.max(0)
+    near = {k: float(likely[k]) for k in candidates if factor[k] > VERY_STRONG}
+    if near:
+        near_fit = fit_with_curvatures(near)
+        alternatives = (dict.fromkeys(near, 0.0), near)
+        far_values, near_values = (fit_with_curvatures(c, near_fit, LIGHTS_ONLY).light_values for c in alternatives)
+        given_materials = (np.array(far_values) - near_values) / 2
+        factor[list(near)] = np.minimum(factor, given_materials)[list(near)]
+    for k in candidates:
         evidence[k] = Decision(bool(factor[k] > VERY_STRONG), log_bayes_factor=float(factor[k]))
     curvatures = {k: c * near_share(factor[k]) for k, c in near.items() if evidence[k].accepted}
-    return Selection(fit_with_curvatures(far | curvatures, near_fit) if curvatures else far_fit, evidence)
+    return Selection(fit_with_curvatures(curvatures) if curvatures else before, evidence)
 
 
 def near_share(log_bayes_factor: float) -> float:

@@ -186,23 +186,19 @@ class Descent(msgspec.Struct, frozen=True):
         self.report(sum(system.loss for system in systems) / max(values, 1))
         return DescentState(theta, likelihoods, sum(system.value for system in systems) + prior.value, systems, prior)
 
-    def arrow(self, state: DescentState, damping: float = 0.0) -> tuple[Vector, Float[np.ndarray, "k k"], Arrow]:
-        """Return a and D of (2), and the factorised H with D and the damping μ."""
-        by_determinant, hessian = determinant_terms(state.systems, state.theta.size)
+    def _step(self, state: DescentState, damping: float) -> tuple[list[LightLikelihood], Float[np.ndarray, "m 7"]]:
+        """Return lights and materials at the minimum of (2)."""
+        size = state.theta.size
+        by_determinant, hessian = determinant_terms(state.systems, size)
         # half the gradient of (1) by materials; unknowns at a limit that it would push beyond it are fixed
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        lower, upper = material_limits(state.theta, self.free)
-        free = np.where(gradient > 0, lower < 0, upper > 0)
-        return by_determinant, hessian, Arrow(state.systems, state.prior.hessian + hessian, free, damping)
-
-    def _step(self, state: DescentState, damping: float) -> tuple[list[LightLikelihood], Float[np.ndarray, "m 7"]]:
-        """Return lights and materials at the minimum of (2)."""
         limits = [material_limits(state.theta, self.free), *(light_limits(each.light) for each in state.likelihoods)]
-        by_determinant, hessian, arrow = self.arrow(state, damping)
+        free = np.where(gradient > 0, limits[0][0] < 0, limits[0][1] > 0)
+        # H with D and the damping μ
+        arrow = Arrow(state.systems, state.prior.hessian + hessian, free, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
-        size = state.theta.size
         ends = np.cumsum([size, *(len(system.light_gradient) for system in state.systems)])[:-1]
 
         def apply_step(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
