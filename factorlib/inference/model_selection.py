@@ -2,9 +2,9 @@
 
 effects     No shadows, shadows of the given meshes, or shadows with interreflection, on fewer observations and cells.
             Shadows are fitted from every first guess, and the model without them goes one step from the best result.
-            Unless held-out observations clearly support shadows against that, both models continue from there.  Shadows
-            stay unless held-out observations are against them.  Interreflection needs shadows, and a marginal
-            likelihood that supports it.
+            If held-out observations do not clearly support shadows then, both models continue from there.  Shadows stay
+            unless held-out observations are against them.  Interreflection needs shadows, and a marginal likelihood
+            that supports it.
 background  The surroundings that photos show are observations of a light unless the objects are strongly against it.
 tone        Exponents of tone curves are freed for all photos, at first for one step.  A light keeps its curves under
             three conditions: the evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher,
@@ -144,12 +144,16 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
     return Decision(margin > least, loss_with, loss_without, margin)
 
 
-def for_any(number: int) -> float:
-    """Return the margin that the largest of `number` margins exceeds by chance as seldom as one exceeds `CLEARLY_FOR`.
+def simultaneous_margin(number: int) -> float:
+    """Return `CLEARLY_FOR` with Bonferroni's correction for several margins.
 
-    Each light may get tone curves, so that many lights would often have one by chance (Bonferroni).
+    Any of them exceeds it by chance as seldom as a single margin exceeds `CLEARLY_FOR`.  Every light may get tone
+    curves; under the threshold of one light, one of many would often get them by chance.
 
-    >>> round(for_any(1), 9), round(for_any(6), 2)
+    Args:
+        number: Number of margins.
+
+    >>> round(simultaneous_margin(1), 9), round(simultaneous_margin(6), 2)
     (2.0, 2.67)
     """
     return float(-ndtri(ndtr(-CLEARLY_FOR) / number))
@@ -208,16 +212,16 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     fit, losses = fit_best(*with_shadows)
     decision = Decision(True)
     if shadows == "auto" and not problem.none_held_out:
-        bare = run.fit("shadows", sample.with_effects(False, False), fit, ONE_STEP)
-        bare_losses = held_out_losses(sample.with_effects(False, False), bare.point)
-        decision = compare_models(bare_losses, losses, CLEARLY_AGAINST)
+        plain = run.fit("shadows", sample.with_effects(False, False), fit, ONE_STEP)
+        plain_losses = held_out_losses(sample.with_effects(False, False), plain.point)
+        decision = compare_models(plain_losses, losses, CLEARLY_AGAINST)
         if (decision.margin or 0.0) < CLEARLY_FOR:  # both continue from one fit
             starts = [fit]
             fit, losses = fit_best(*with_shadows)
-            bare, bare_losses = fit_best("no shadows", False, False)
-            decision = compare_models(bare_losses, losses, CLEARLY_AGAINST)
+            plain, plain_losses = fit_best("no shadows", False, False)
+            decision = compare_models(plain_losses, losses, CLEARLY_AGAINST)
             if not decision.accepted:
-                return SolveState(bare, bare, decision)
+                return SolveState(plain, plain, decision)
     if bounces == "auto":
         selection = select_interreflection(sample, fit, run)
         return SolveState(selection.fit, selection.fit, decision, selection.evidence[0])
@@ -339,7 +343,7 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
         )
         without, with_curves = (held_out_losses(sample, fit.point) for fit in (plain, curved))
         pairs = ((without.one_light(k), with_curves.one_light(k)) for k in range(len(freed)))
-        return plain, curved, [compare_models(*pair, for_any(len(freed))) for pair in pairs]
+        return plain, curved, [compare_models(*pair, simultaneous_margin(len(freed))) for pair in pairs]
 
     plain, curved, compared = compare(ONE_STEP)
     if any(gains(decision, LEAST_TONE_GAIN / 2) for decision in compared):

@@ -2,7 +2,7 @@
 
 start       Materials and lights are fitted on few cells, with the shadows and interreflection of the given meshes.
             Lights are then fitted on `CELLS` cells: with fewer, turned normals explain what cells blur, and exact
-            surfaces in sharp lights were moved (log Bayes factors of 34 and 145, now -15 and -243).  Lights are
+            surfaces in sharp lights were moved (log Bayes factors of 34 and 145 instead of −15 and −243).  Lights are
             infinitely far away: near lights absorb what turns of wrong normals should explain (rough set of seed 0: 3.5
             instead of 3.1 degrees).
 stiffness   Lights are linearised once, on the mesh itself.  For each of `TURN_STIFFNESSES`, from stiff to soft, and for

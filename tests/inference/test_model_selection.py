@@ -25,11 +25,11 @@ from factorlib.inference.model_selection import (
     VERY_STRONG,
     Losses,
     compare_models,
-    for_any,
     near_share,
     select_distances,
     select_effects,
     select_tone_curves,
+    simultaneous_margin,
 )
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.options import SolveOptions
@@ -191,7 +191,8 @@ def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_loss
     assert [one.accepted for one in result.tone][:2] == [True, True]
     for one in result.tone:
         assert one.accepted == (
-            one.margin > for_any(3) and one.held_out_loss_without > (1 + LEAST_TONE_GAIN) * one.held_out_loss_with
+            one.margin > simultaneous_margin(3)
+            and one.held_out_loss_without > (1 + LEAST_TONE_GAIN) * one.held_out_loss_with
         )
 
 
