@@ -7,7 +7,8 @@
 with the cell's own lobe as the kernel, over the observed texels j of direction ω_j and solid angle Ω_j.  Surroundings
 are neither diffuse nor where the ground plane says, and objects shade the ground below them.  Each cell therefore has
 an error of its own, of standard deviation `DEVIATION`/√c, and all cells together are too bright or too dark by a factor
-per channel, whose logarithms have the covariance T of `SCALE_DEVIATION` and `TINT_DEVIATION`.  With A the columns that
+per channel, whose logarithms have the covariance T of `SCALE_DEVIATION` and `TINT_DEVIATION`.  Where objects contradict
+a background, all its standard deviations are wider (`factorlib.inference.model_selection`).  With A the columns that
 select the cells of a channel, the error of b has the covariance D⁻¹ + A T Aᵀ and, by Woodbury, the precision R.  For
 u ~ N(0, Q⁻¹) that gives u ~ N(m, P⁻¹) with
 
@@ -48,11 +49,13 @@ class Background(msgspec.Struct, frozen=True):
         direction: Unit vectors in the light's frame.
         radiance: Radiance in the unit of the block.
         solid_angle: Solid angle of each direction's texel.
+        width: Factor on all standard deviations of its errors.
     """
 
     direction: Float[np.ndarray, "k 3"]
     radiance: Float[np.ndarray, "k 3"]
     solid_angle: Float[np.ndarray, " k"]
+    width: float = 1.0
 
     @staticmethod
     def from_map(lat_long: Float[np.ndarray, "h w 3"], rotation: Float[np.ndarray, "3 3"], unit: float) -> Background:
@@ -84,9 +87,8 @@ def concatenate_backgrounds(backgrounds: list[Background]) -> Background | None:
     wide = [background for background in backgrounds if background.solid_angle.sum() > LEAST_COVERAGE * 4 * np.pi]
     if not wide:
         return None
-    return Background(
-        *(np.concatenate([getattr(each, name) for each in wide]) for name in Background.__struct_fields__)
-    )
+    names = "direction", "radiance", "solid_angle"
+    return Background(*(np.concatenate([getattr(each, name) for each in wide]) for name in names))
 
 
 def condition_on_background(
@@ -100,8 +102,8 @@ def condition_on_background(
         light: Cells and suns of the light.
     """
     coverage, log_radiance = background.observe(light)
-    D = coverage / DEVIATION**2
-    shared = np.linalg.inv(np.linalg.inv(SHARED_COVARIANCE) + D.sum() * np.eye(3))
+    D = coverage / (background.width * DEVIATION) ** 2
+    shared = np.linalg.inv(np.linalg.inv(background.width**2 * SHARED_COVARIANCE) + D.sum() * np.eye(3))
     R = np.diag(np.tile(D, 3)) - np.kron(shared, np.outer(D, D))
     P = Q + R
     factor = cholesky(P, lower=True, check_finite=False)

@@ -13,6 +13,7 @@ PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "inverse_sigma", "material", "photo", "held_out"),
     *("visibility", "bounced", "confidence", "place", "row", "detail", "given_normal"),  # optional columns
 )
+LEAST_CONFIDENCE = 0.05  # of a normal: a smaller one counts as this
 CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
 
 
@@ -92,7 +93,7 @@ class Block(msgspec.Struct, frozen=True):
         bounced: Radiance that hidden directions send, weighted by the cosine (RGB) and by a highlight (RGB): G_d and
             G_s of `factorlib.inference.interreflection`, in `unit`; None for no interreflection.
         noise: Noise model; `inverse_sigma` derives from its σ.
-        confidence: Confidence of the normals, 0 to 1; None if all are equally reliable.
+        confidence: Confidence of the normals, `LEAST_CONFIDENCE` to 1; None if all are equally reliable.
         place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
         row: Index of the observation among all usable ones.
         background: Surroundings that the photos show; None if they are not used.
@@ -163,6 +164,12 @@ class Block(msgspec.Struct, frozen=True):
         bounced = self.bounced if shadows and bounces else None
         ground = self.ground if shadows else None
         return msgspec.structs.replace(self, visibility=visibility, bounced=bounced, ground=ground)
+
+    def with_background_width(self, width: float) -> Block:
+        """Return the same observations with this width of the errors of their background, if they have one."""
+        if self.background is None:
+            return self
+        return msgspec.structs.replace(self, background=msgspec.structs.replace(self.background, width=float(width)))
 
     def with_noise(self, noise: Noise) -> Block:
         """Return the same observations under another noise model."""

@@ -112,9 +112,9 @@ class SolveState(msgspec.Struct, frozen=True):
 
     def effective_problem(self, problem: JointProblem) -> JointProblem:
         """Return the problem under the chosen effects: shadows, interreflection, backgrounds and grounds, or not."""
-        backgrounds, grounds = ([each.accepted for each in made] for made in (self.backgrounds, self.grounds))
+        widths = [each.accepted * (each.width or 1.0) for each in self.backgrounds]
         problem = problem.with_effects(self.shadows.accepted, self.interreflection.accepted)
-        return problem.keep_backgrounds(backgrounds).keep_grounds(grounds)
+        return problem.keep_backgrounds(widths).keep_grounds([each.accepted for each in self.grounds])
 
 
 class Solution(SolveState, frozen=True, kw_only=True):

@@ -169,17 +169,18 @@ class Illumination(msgspec.Struct, frozen=True):
     def by_normal(self) -> Float[np.ndarray, "n 3 3"]:
         """Return ∂r/∂n of each observation, channel by axis, in the tangent plane of its normal."""
         block = self.block
-        radiance = self.radiance()
+        lit = np.zeros((len(block), 3))
+        slopes = np.zeros((len(block), 3, 3))
+        for m, rows in material_slices(block):
+            lit[rows], slopes[rows] = self._linear_by_normal(m, rows)
+        radiance = self.light.apply_tone(lit + self.bounced, block.photo)
         # ∂r/∂ℓ; a satisfied bound has no residual
         rising = block.inverse_sigma * self.light.tone_slope(radiance, block.photo)
         rising = np.where(block.clipped & (radiance >= block.radiance), 0.0, rising)
-        linear = np.zeros((len(block), 3, 3))
-        for m, rows in material_slices(block):
-            linear[rows] = self._linear_by_normal(m, rows)
-        return rising[:, :, None] * linear
+        return rising[:, :, None] * slopes
 
-    def _linear_by_normal(self, m: int, rows: slice) -> Float[np.ndarray, "n 3 3"]:
-        """Return ∂ℓ/∂n of the observations `rows`, of material m, by the operator's derivatives."""
+    def _linear_by_normal(self, m: int, rows: slice) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+        """Return the part of ℓ that the light sends, and ∂ℓ/∂n, of the observations `rows`, of material m."""
         block = self.block.take(np.arange(len(self.block))[rows])
         every = slice(len(block))
         lobes = self.light.unit_lobes
@@ -211,7 +212,7 @@ class Illumination(msgspec.Struct, frozen=True):
             specular = unit.specular + NORMAL_STEP * (unit.specular_by_nz * tz + unit.specular_by_no * to)
             slope = (reflect(normal + NORMAL_STEP * along, diffuse, specular) - before) / NORMAL_STEP
             result += slope[:, :, None] * along[:, None, :]
-        return result
+        return before, result
 
     def losses(self, loss: RobustLoss) -> Float[np.ndarray, " n"]:
         """Return the robust loss of every observation, averaged over its channels."""

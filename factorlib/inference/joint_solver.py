@@ -39,6 +39,7 @@ from factorlib.inference.model_selection import (
     select_grounds,
     select_tone_curves,
 )
+from factorlib.inference.normal_errors import with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.splitting import split_cells
@@ -80,9 +81,16 @@ class SolveRequest(msgspec.Struct, frozen=True):
         """Return the observations with reliable normals, under the chosen effects."""
         return state.effective_problem(reliable_observations(self.problem))
 
+    def reliable_sample(self, state: SolveState, observations: int) -> JointProblem:
+        """Return that many observations of a light with reliable normals, with errors of normals as at the state."""
+        return with_normal_errors(
+            self.reliable_problem(state).subsample(observations, self.options.seed), state.fit.point
+        )
+
     def light_problem(self, state: SolveState) -> JointProblem:
         """Return the observations of any confidence that lights are fitted to, under the chosen effects."""
-        return state.effective_problem(self.problem).subsample(state.light_observations, self.options.seed)
+        sample = state.effective_problem(self.problem).subsample(state.light_observations, self.options.seed)
+        return with_normal_errors(sample, state.fit.point)
 
 
 def solve(
@@ -183,17 +191,16 @@ def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
     Lights have `SolveOptions.cells` cells, of which some split.  If some did and the model explains the observations
     closely, more of them are fitted, and cells may split further.
     """
-    problem = request.reliable_problem(state)
     options, run = request.options, request.run
     observations = options.observations
-    sample = problem.subsample(observations, options.seed)
+    sample = request.reliable_sample(state, observations)
     fit = run.fit("splitting", sample, refine_cells(state.fit, options.cells, sample), REFINED)
     fit, evidence = split_cells("splitting", sample, fit, options.splittings, run)
     fit = run.fit("materials and lights", sample, fit, MATERIALS)
     splittings = sum(decision.accepted for decision in evidence)
     if splittings and sample.fitted_loss(fit.point) < SMALL_LOSS:
         observations = OBSERVATION_FACTOR * observations
-        sample = problem.subsample(observations, options.seed)
+        sample = request.reliable_sample(state.with_fit(fit), observations)
         limit = options.splittings - splittings
         fit, further = split_cells("more observations", sample, fit, limit, run)
         fit = run.fit("more observations", sample, fit, CLOSER)
@@ -203,7 +210,7 @@ def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
 
 def apply_prior(request: SolveRequest, state: SolveState) -> SolveState:
     """Combine the fitted materials with the prior on materials, by the errors of the model."""
-    sample = request.reliable_problem(state).subsample(state.observations, request.options.seed)
+    sample = request.reliable_sample(state, state.observations)
     request.run.enter("prior")
     materials, errors = Posterior(sample, state.fit, request.run.prior).with_prior()
     fit = msgspec.structs.replace(state.fit, point=Point(materials, state.fit.point.lights))

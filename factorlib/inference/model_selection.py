@@ -5,7 +5,8 @@ effects     No shadows, shadows of the given meshes, or shadows with interreflec
             If held-out observations do not clearly support shadows then, both models continue from there.  Shadows stay
             unless held-out observations are against them.  Interreflection needs shadows, and a marginal likelihood
             that supports it.
-background  The surroundings that photos show are observations of a light unless the objects are strongly against it.
+background  The surroundings that photos show are observations of a light.  Where the objects are strongly against them,
+            their errors are twice as wide, or four times; beyond that they are left out.
 tone        Exponents of tone curves are freed for all photos, at first for one step.  A light keeps its curves under
             three conditions: the evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher,
             and they end within the range of real cameras.  An exponent also fits some errors of the rest of the model,
@@ -50,6 +51,7 @@ from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
 from factorlib.inference.fit_runner import FitRunner, SolveState
 from factorlib.inference.materials import Point
+from factorlib.inference.normal_errors import with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
@@ -81,9 +83,10 @@ CURVATURES = (0.05, 0.1, 0.2)
 DISTANCE_SCHEDULE = FitSchedule(light_steps=2, descents=(2,), estimate_first=False)
 LIGHTS_ONLY = FitSchedule(light_steps=3, materials_fixed=True)
 TEMPERED_LIGHTS = FitSchedule(descents=(0, 3), temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True)
-# Log Bayes factor against a background above which it is left out.  It is three times `VERY_STRONG`, because objects
+# Log Bayes factor against a background above which its errors are wider than they were thought to be.  It is three times `VERY_STRONG`, because objects
 # say little of most directions that a background shows, and the errors of the model count against it.
 BACKGROUND_DOUBT = 15.0
+WIDEST = 4.0  # largest width of a background: a factor of 5 in radiance, at one standard deviation
 LEAST_CORRELATION = 0.3  # of shadows on the ground, predicted and observed
 
 
@@ -178,9 +181,10 @@ def gains(decision: Decision, least: float, negligible: float = 0.0) -> bool:
     return without + negligible > (1 + least) * (with_part + negligible)
 
 
-def comparison_sample(problem: JointProblem, options: SolveOptions) -> JointProblem:
-    """Return the subsample of observations on which models are fitted and compared."""
-    return problem.subsample(min(TRIAL_OBSERVATIONS, options.observations), options.seed)
+def comparison_sample(problem: JointProblem, fit: Fit, options: SolveOptions) -> JointProblem:
+    """Return the subsample of observations on which models are compared, with errors of normals as at a fit."""
+    sample = problem.subsample(min(TRIAL_OBSERVATIONS, options.observations), options.seed)
+    return with_normal_errors(sample, fit.point)
 
 
 def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptions, run: FitRunner) -> SolveState:
@@ -192,7 +196,7 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
         options: Options of the user.
         run: Runner of the fits.
     """
-    sample = comparison_sample(problem, options).keep_backgrounds([]).keep_grounds([])
+    sample = comparison_sample(problem, starts[0], options).keep_backgrounds([]).keep_grounds([])
     hidden = any(block.visibility is not None for block in problem.blocks)
     shadows = options.self_shadowing if hidden else "off"
     bounces = options.interreflection if problem.has_bounces else "off"
@@ -261,8 +265,8 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
     """Choose by marginal likelihood the lights that are also observed by the surroundings that photos show.
 
     Materials and all lights are fitted with all backgrounds.  Given these materials, each light is fitted with its
-    background and without it.  A background is left out only if the observations are against it: they say little about
-    most of the directions that it shows.
+    background and without it.  If the observations are strongly against a background, its errors are twice as wide, and
+    it is left out beyond `WIDEST`.  Observations say little about most of the directions that it shows.
 
     Args:
         problem: Observations with reliable normals, with the backgrounds of all lights.
@@ -274,27 +278,28 @@ def select_backgrounds(problem: JointProblem, before: Fit, options: SolveOptions
     candidates = [block.background is not None and not light.fixed.any() for block, light in pairs]
     if options.background == "off" or not any(candidates):
         return Selection(before, [Decision(False) for _ in candidates])
-    sample = comparison_sample(problem, options)
+    sample = comparison_sample(problem, before, options)
     without = sample.keep_backgrounds([])
-    accepted = np.array(candidates)
+    widths = np.array(candidates, float)
     factors = np.zeros(len(candidates))
     fit = before
-    while accepted.any():
-        model = sample.keep_backgrounds(accepted.tolist())
+    while widths.any():
+        model = sample.keep_backgrounds(widths.tolist())
         fit = run.fit("background", model, fit, BACKGROUND_SCHEDULE)
         start = run.fit("background", without, fit, TEMPERED_LIGHTS)
         values = [run.fit("background", each, start, LIGHTS_ONLY).light_values for each in (without, model)]
-        factors = np.where(accepted, (np.array(values[0]) - values[1]) / 2, factors)
+        factors = np.where(widths > 0, (np.array(values[0]) - values[1]) / 2, factors)
         # the worst first: they shift the scale of all
-        doubtful = accepted & (factors < min(-BACKGROUND_DOUBT, factors[accepted].min() / 2))
+        doubtful = (widths > 0) & (factors < min(-BACKGROUND_DOUBT, factors[widths > 0].min() / 2))
         if not doubtful.any():
             break
-        accepted &= ~doubtful
-    if not accepted.any():
+        widths[doubtful] *= 2
+        widths[widths > WIDEST] = 0
+    if not widths.any():
         fit = before
     evidence = [
-        Decision(bool(keep), log_bayes_factor=float(factor)) if has else Decision(False)
-        for keep, factor, has in zip(accepted, factors, candidates, strict=True)
+        Decision(bool(width), log_bayes_factor=float(factor), width=float(width)) if has else Decision(False)
+        for width, factor, has in zip(widths, factors, candidates, strict=True)
     ]
     return Selection(fit, evidence)
 
@@ -329,7 +334,7 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
     curved_before = [len(light.log_tone) > 0 for light in start.point.lights]
     if options.tone == "off" or problem.none_held_out:
         return Selection(start, [Decision(has) for has in curved_before])
-    sample = comparison_sample(problem, options)
+    sample = comparison_sample(problem, start, options)
     freed = [
         light if has else msgspec.structs.replace(light, log_tone=np.zeros_like(light.log_exposure))
         for light, has in zip(start.point.lights, curved_before, strict=True)
@@ -379,7 +384,7 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
     evidence = [Decision(light.curvature > 0) for light in before.point.lights]
     if options.distance == "off" or not candidates:
         return Selection(before, evidence)
-    sample = comparison_sample(problem, options)
+    sample = comparison_sample(problem, before, options)
 
     def fit_with_curvatures(
         curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE

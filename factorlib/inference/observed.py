@@ -17,7 +17,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.images.exr import read_rgb_exr
 from factorlib.inference.background import Background, concatenate_backgrounds
-from factorlib.inference.blocks import CLUSTER, Block, Noise
+from factorlib.inference.blocks import CLUSTER, LEAST_CONFIDENCE, Block, Noise
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.problem import Spread
 from factorlib.urm.extract import with_surface_normals
@@ -179,6 +179,8 @@ def _block(
         _rotate_units(vectors, observations, turned)
         for vectors in (observations.normal, observations.cell_normal, observations.view)
     )
+    sure = observations.confidence
+    sure = None if sure is None else np.maximum(sure.astype(float), LEAST_CONFIDENCE)
     radiance = observations.radiance.astype(float)
     # radiance in units of the weighted mean
     unit = max(float(np.average(radiance.mean(1), weights=observations.weight)), 1e-30)
@@ -191,12 +193,14 @@ def _block(
         visibility = observations.visibility
         directions = np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
     bounced = bounced_light(observations, scaled)
+    # the confidence of a normal counts as its variance, where that matters (`factorlib.inference.normal_errors`)
+    pixels = observations.weight / (1.0 if sure is None else sure)
     block = Block(
         name, tuple(photos), unit, normal, view, scaled,
-        observations.clipped.astype(bool), noise.inverse_sigma(scaled, observations.weight),
+        observations.clipped.astype(bool), noise.inverse_sigma(scaled, pixels),
         observations.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
-        None if observations.confidence is None else observations.confidence.astype(float),
+        sure,
         None if observations.place is None else _rotate(observations.place, observations, turned), rows[order],
         given_normal=None if observations.given_normal is None else given_normal,
     )  # fmt: skip

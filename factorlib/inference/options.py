@@ -27,8 +27,8 @@ class SolveOptions(Struct, frozen=True):
     """Light that surfaces send each other, as the photo shows it; needs self_shadowing.  auto: on, if the
     marginal likelihood supports it very strongly (log Bayes factor over 5)."""
     background: Literal["auto", "off"] = "auto"
-    """Surroundings that photos show, as observations of the light; auto: used unless the marginal likelihood of the
-    objects is strongly against it (log Bayes factor below -15)."""
+    """Surroundings that photos show, as observations of the light; auto: with wider errors where the marginal
+    likelihood of the objects is strongly against it (log Bayes factor below -15), and at last not."""
     ground: Literal["auto", "off"] = "auto"
     """Shadows that objects cast on the ground, as observations of the light; auto: used if they lie where the light
     that the objects tell of casts them (correlation from 0.3 on)."""

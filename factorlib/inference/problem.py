@@ -119,9 +119,11 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Return the problem with shadows or interreflection switched off where the argument is False."""
         return self.with_blocks([block.with_effects(shadows, bounces) for block in self.blocks])
 
-    def keep_backgrounds(self, keep: Sequence[bool]) -> JointProblem:
-        """Return the problem with the backgrounds of those lights alone for which `keep` is True; empty for none."""
-        return self._keep("background", keep)
+    def keep_backgrounds(self, widths: Sequence[float]) -> JointProblem:
+        """Return the problem with backgrounds of these widths, in order of lights; 0 leaves one out, and [] all."""
+        problem = self._keep("background", [width > 0 for width in widths])
+        pairs = zip(problem.blocks, widths or [0.0] * len(problem.blocks), strict=True)
+        return self.with_blocks([block.with_background_width(width) for block, width in pairs])
 
     def keep_grounds(self, keep: Sequence[bool]) -> JointProblem:
         """Return the problem with the grounds of those lights alone for which `keep` is True; empty for none."""

@@ -4,7 +4,8 @@ start       Materials and lights are fitted on few cells, with the shadows and i
             Lights are then fitted on `CELLS` cells: with fewer, turned normals explain what cells blur, and exact
             surfaces in sharp lights were moved (log Bayes factors of 34 and 145 instead of −15 and −243).  Lights are
             infinitely far away: near lights absorb what turns of wrong normals should explain (rough set of seed 0: 3.5
-            instead of 3.1 degrees).
+            instead of 3.1 degrees).  Observations count by the confidence of their normals, because turns are to
+            explain what wrong normals do, but not at rims and on thin parts.
 stiffness   Lights are linearised once, on the mesh itself.  For each of `TURN_STIFFNESSES`, from stiff to soft, and for
             every fold, turns are estimated from all photos outside the fold.  The linearised model gives the likelihood
             of a photo of the fold in a light of its own (`LightTerms.change`).  The stiffness with the largest one is
@@ -52,6 +53,7 @@ from factorlib.inference.model_selection import (
     select_effects,
 )
 from factorlib.inference.optimizer import descend_light
+from factorlib.inference.normal_errors import weighed_by_confidence
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import InitialFit, Start, refine_cells
@@ -419,7 +421,7 @@ def fit_trial(
     lit = reliable.with_effects(effects.shadows.accepted, effects.interreflection.accepted)
     selection = select_backgrounds(lit, effects.fit, choices, run)
     effects = effects.with_fit(selection.fit, backgrounds=selection.evidence)
-    problem = effects.effective_problem(problem)
+    problem = weighed_by_confidence(effects.effective_problem(problem))
     finer = refine_cells(effects.fit, CELLS, problem)
     fit = run.fit("surface", problem.subsample(OBSERVATIONS, seed), finer, LIGHTS_SCHEDULE)
     return DetailTrial(problem, fit, *surface, run.prior), InitialFit.from_fit(effects.fit, problem.blocks)

@@ -67,6 +67,7 @@ from factorlib.inference.likelihood import (
 from factorlib.inference.material_posterior import material_posterior
 from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, MaterialErrors, Materials, Point
+from factorlib.inference.normal_errors import with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
@@ -87,7 +88,6 @@ MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.06])
 LIGHT_ERROR = 0.7
 # Standard deviation of normals of (2), radians, chosen on made chairs whose true normals are known.
 NORMAL_ERROR = np.radians(1.5)
-LEAST_CONFIDENCE = 0.02  # of a normal: a smaller one counts as this
 COVERAGE_ROWS = 32  # rows of the maps of a light's relative standard errors
 LARGEST_RELATIVE_ERROR = 1000.0  # upper limit in these maps
 
@@ -117,6 +117,7 @@ def estimate_uncertainty(
     in_gauge = errors.materials.rows() * (solution.point.materials.rows() / fitted)
     errors = msgspec.structs.replace(errors, materials=Materials.from_rows(in_gauge))
     light_sample = problem.subsample(solution.light_observations, options.seed)
+    light_sample = with_normal_errors(light_sample, solution.fit.point)
     return errors, Posterior(light_sample, solution.fit, solution.prior, tick).relative_standard_errors()
 
 
@@ -248,7 +249,7 @@ def normal_turns(likelihood: LightLikelihood) -> list[Grouping]:
     block = likelihood.illumination.block
     if block.confidence is None:
         return []
-    unsure = np.sqrt(1 / np.maximum(block.confidence, LEAST_CONFIDENCE) - 1)
+    unsure = np.sqrt(1 / block.confidence - 1)
     weight = likelihood.illumination.root_weights(
         likelihood.illumination.residuals(), likelihood.loss, likelihood.temperature
     )

@@ -140,6 +140,7 @@ class Decision(msgspec.Struct, frozen=True):
         margin: increase of the loss without it, in standard errors
         log_bayes_factor: log marginal likelihood with it, less that without it
         correlation: of shadows on the ground, predicted by the objects alone and observed
+        width: factor on the errors of a background, which is more than 1 where the objects contradict it
     """
 
     accepted: bool = msgspec.field(name="kept")
@@ -148,6 +149,7 @@ class Decision(msgspec.Struct, frozen=True):
     margin: float | None = None
     log_bayes_factor: float | None = None
     correlation: float | None = None
+    width: float | None = None
 
 
 class WarmStart(msgspec.Struct, frozen=True):

@@ -34,16 +34,17 @@ def lower_half(light, unit=1.0, factor=1.0) -> Background:
     return Background.from_map(factor * radiance * (directions[..., 1:2] < 0), np.eye(3), unit)
 
 
-def test_the_prior_given_a_background_is_that_of_gaussian_regression():
+@pytest.mark.parametrize("width", [1.0, 2.0])
+def test_the_prior_given_a_background_is_that_of_gaussian_regression(width):
     light = on_even_cells(drawn(3, 80))
     Q, _ = PRIOR.precision(light.axis)
-    background = lower_half(light)
+    background = msgspec.structs.replace(lower_half(light), width=width)
     mean, P, log_determinant = condition_on_background(Q, background, light)
     # the slow way, by covariances: K = Q⁻¹, m = K_s (K_ss + N)⁻¹ b, P⁻¹ = K − K_s (K_ss + N)⁻¹ K_sᵀ over seen cells s
     coverage, b = background.observe(light)
     s = np.flatnonzero(np.tile(coverage, 3) > 1e-9)
     K, D = np.linalg.inv(Q), np.tile(coverage, 3) / DEVIATION**2
-    errors = np.diag(1 / D[s]) + np.kron(SHARED_COVARIANCE, np.ones((80, 80)))[np.ix_(s, s)]
+    errors = width**2 * (np.diag(1 / D[s]) + np.kron(SHARED_COVARIANCE, np.ones((80, 80)))[np.ix_(s, s)])
     gain = K[:, s] @ np.linalg.inv(K[np.ix_(s, s)] + errors)
     np.testing.assert_allclose(mean, gain @ b.T.reshape(-1)[s], atol=1e-6)
     np.testing.assert_allclose(np.linalg.inv(P), K - gain @ K[s], atol=1e-6)
@@ -106,6 +107,15 @@ def test_backgrounds_give_reflectances_without_a_gauge_and_one_that_is_wrong_is_
     assert error < 0.2
     off = solve(lit, start_from_photos(3), msgspec.structs.replace(QUICK, background="off"))
     assert not any(each.accepted for each in off.backgrounds) and log_scale(off) > error + 0.1
+
+
+def test_a_background_that_objects_contradict_by_a_factor_of_three_is_trusted_less_and_not_left_out(lit):
+    background = lit.blocks[1].background
+    uneven = background.radiance * np.where(background.direction[:, :1] > 0, 3.0, 1 / 3)
+    doubted = msgspec.structs.replace(lit.blocks[1], background=msgspec.structs.replace(background, radiance=uneven))
+    solution = solve(lit.with_blocks([lit.blocks[0], doubted, lit.blocks[2]]), start_from_photos(3), QUICK)
+    assert [each.accepted for each in solution.backgrounds] == [True] * 3
+    assert solution.backgrounds[1].width > 1 == solution.backgrounds[0].width == solution.backgrounds[2].width
 
 
 @pytest.mark.long

@@ -1,0 +1,48 @@
+"""Variance of an observation by the error of its normal.
+
+A normal that is wrong by δn changes the predicted radiance by ∂y/∂n · δn: much in a highlight or where light changes
+fast, little in soft light.  With δn ~ N(0, s²) along each tangent, integrated out to first order (Bayesian approximation
+error: Kaipio and Somersalo 2007, "Statistical inverse problems: discretization, model reduction and inverse crimes"),
+the variance of a channel becomes
+
+    σ'² = σ² + s² |∂y/∂n|²,        s = DEVIATION/c,                                                                (1)
+
+with the confidence c of the normal (`factorlib.align.reliability`).  The derivative is that at the materials and the
+light with which a step of the solve begins, so that all models that are compared weigh observations alike.  Merged
+observations share the error of their normal, which no number of them averages out.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from factorlib.inference.blocks import Block
+from factorlib.inference.forward import Illumination
+from factorlib.inference.materials import Point
+from factorlib.inference.problem import JointProblem
+
+# Standard deviation along a tangent, radians, of normals of confidence 1.  On data/eames, whose true normals are known,
+# the RMS along a tangent is 0.9, 1.2, 7.6 and 14 degrees where c is about 0.95, 0.75, 0.2 and 0.07.
+DEVIATION = np.radians(1.0)
+
+
+def with_normal_errors(problem: JointProblem, point: Point) -> JointProblem:
+    """Return the problem whose observations have the variance (1), with the derivatives at a point."""
+    return problem.with_blocks(list(problem.spread(_widen, problem.illuminations(point))))
+
+
+def weighed_by_confidence(problem: JointProblem) -> JointProblem:
+    """Return the problem whose observations have the share c of their weight, and not the variance (1)."""
+    weights = [1.0 if block.confidence is None else np.sqrt(block.confidence)[:, None] for block in problem.blocks]
+    pairs = zip(problem.blocks, weights, strict=True)
+    return problem.with_blocks([msgspec.structs.replace(b, inverse_sigma=b.inverse_sigma * w) for b, w in pairs])
+
+
+def _widen(illumination: Illumination) -> Block:
+    """Return the observations of one light with the variance (1)."""
+    block = illumination.block
+    if block.confidence is None:
+        return block
+    whitened = np.linalg.norm(illumination.by_normal(), axis=2) * (DEVIATION / block.confidence)[:, None]
+    return msgspec.structs.replace(block, inverse_sigma=block.inverse_sigma / np.sqrt(1 + whitened**2))

@@ -1,0 +1,70 @@
+"""Variance of observations by errors of their normals: held to draws of turned normals."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.inference.forward import Illumination
+from factorlib.inference.materials import Point
+from factorlib.inference.normal_errors import DEVIATION, with_normal_errors
+from factorlib.inference.problem import JointProblem
+from factorlib.reflection import reflection_operator
+from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_block
+
+OPERATOR = reflection_operator("closed_form")
+DRAWS = 400
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """Return spheres of three materials in one light, and the point that they were rendered from."""
+    rng = np.random.default_rng(4)
+    light = random_light(rng, 8)
+    block = sphere_block("light0", light, MATERIALS, [0, 1, 2], OPERATOR, size=12)
+    block = msgspec.structs.replace(block, confidence=rng.uniform(0.3, 1.0, len(block)))
+    return JointProblem([block], OPERATOR), Point(MATERIALS, [light])
+
+
+def widening(problem, point):
+    """Return the factor on σ of every observation."""
+    (before,) = problem.blocks
+    (after,) = with_normal_errors(problem, point).blocks
+    return before.inverse_sigma / after.inverse_sigma
+
+
+def test_the_variance_is_that_of_radiance_at_turned_normals(problem):
+    of, point = problem
+    (block,) = of.blocks
+    rng = np.random.default_rng(0)
+    # tangents of every normal, and normals turned by draws along both
+    first = np.cross(block.normal, np.eye(3)[np.abs(block.normal).argmin(1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    tangents = np.stack([first, np.cross(block.normal, first)], axis=1)
+    deviation = 0.1 * DEVIATION / block.confidence  # a tenth, at which radiance is linear in the turn
+    residuals = []
+    for _ in range(DRAWS):
+        turned = block.normal + np.einsum("nt,ntx->nx", deviation[:, None] * rng.normal(size=(len(block), 2)), tangents)
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        drawn = msgspec.structs.replace(block, normal=turned)
+        residuals.append(Illumination(drawn, point.lights[0], point.materials, OPERATOR).residuals())
+    variance = 100 * np.var(residuals, axis=0)
+    ratio = (1 + variance) / widening(*problem) ** 2
+    assert np.median(ratio) == pytest.approx(1, abs=0.01)
+    assert np.quantile(np.abs(ratio - 1), 0.9) < 0.15
+
+
+def test_sure_normals_in_constant_light_count_in_full_and_unsure_ones_less(problem):
+    of, point = problem
+    (block,) = of.blocks
+    sure, unsure = (
+        of.with_blocks([msgspec.structs.replace(block, confidence=np.full(len(block), value))]) for value in (1.0, 0.1)
+    )
+    assert np.all(widening(unsure, point) >= widening(sure, point))
+    assert np.median(widening(unsure, point)) > 1.5 * np.median(widening(sure, point))
+
+
+def test_without_confidence_observations_stay(problem):
+    of, point = problem
+    (block,) = of.blocks
+    plain = of.with_blocks([msgspec.structs.replace(block, confidence=None)])
+    np.testing.assert_array_equal(widening(plain, point), 1.0)
