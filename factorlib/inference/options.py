@@ -22,7 +22,8 @@ class SolveOptions(Struct, frozen=True):
     """Largest number of a light's observations that materials are fitted to, drawn evenly; eight times as many if
     they are explained closely after the first accepted splitting.  Lights alone are fitted to twice as many."""
     self_shadowing: Literal["auto", "on", "off"] = "auto"
-    """Shadows of the meshes; auto: on, unless held-out observations are against them by two standard errors."""
+    """Shadows of the meshes; auto: on, unless the marginal likelihood is very strongly against them (log Bayes factor
+    below -5)."""
     interreflection: Literal["auto", "on", "off"] = "auto"
     """Light that surfaces send each other, as the photo shows it; needs self_shadowing.  auto: on, if the
     marginal likelihood supports it very strongly (log Bayes factor over 5)."""

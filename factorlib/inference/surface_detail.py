@@ -52,8 +52,8 @@ from factorlib.inference.model_selection import (
     select_backgrounds,
     select_effects,
 )
-from factorlib.inference.optimizer import descend_light
 from factorlib.inference.normal_errors import weighed_by_confidence
+from factorlib.inference.optimizer import descend_light
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import InitialFit, Start, refine_cells
