@@ -88,7 +88,8 @@ def concatenate_backgrounds(backgrounds: list[Background]) -> Background | None:
     if not wide:
         return None
     names = "direction", "radiance", "solid_angle"
-    return Background(*(np.concatenate([getattr(each, name) for each in wide]) for name in names))
+    direction, radiance, solid_angle = (np.concatenate([getattr(each, name) for each in wide]) for name in names)
+    return Background(direction, radiance, solid_angle)
 
 
 def condition_on_background(

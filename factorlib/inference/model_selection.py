@@ -58,8 +58,7 @@ from factorlib.results.materials import Decision
 
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
 ONE_CLUSTER = 1.0  # variance of log a_i − log b_i in a light with one cluster, from which none can be estimated
-# Thresholds, in standard errors.  Shadows are dropped only if the evidence is clearly against them.  Tone curves need
-# clear evidence.
+# Thresholds, in standard errors, of evidence from held-out observations.
 CLEARLY_AGAINST = -2.0
 CLEARLY_FOR = 2.0
 WEAKLY_FOR = 1.0
@@ -69,7 +68,7 @@ TRIAL_CELLS = 180
 TRIAL = FitSchedule(light_steps=3, descents=(6, 4))
 CONTINUED_TRIAL = FitSchedule(light_steps=2, descents=(4, 2), estimate_first=False)
 BACKGROUND_SCHEDULE = FitSchedule(light_steps=2, descents=(6,))
-BOUNCE_SCHEDULE = FitSchedule(light_steps=2, descents=(6,), estimate_first=False)
+PAIR_SCHEDULE = FitSchedule(light_steps=2, descents=(6,), estimate_first=False)
 AFTER_BOUNCES = FitSchedule(descents=(2,))
 ONE_STEP = FitSchedule(descents=(1,), estimate_first=False)
 TONE_SCHEDULE = FitSchedule(descents=(8,), estimate_first=False)
@@ -216,16 +215,13 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     fit, losses = fit_best(*with_shadows)
     decision = Decision(True)
     if shadows == "auto" and not problem.none_held_out:
-        plain = run.fit("shadows", sample.with_effects(False, False), fit, ONE_STEP)
-        plain_losses = held_out_losses(sample.with_effects(False, False), plain.point)
-        decision = compare_models(plain_losses, losses, CLEARLY_AGAINST)
-        if (decision.margin or 0.0) < CLEARLY_FOR:  # few clusters do not tell: both continue from one fit
-            models = [sample.with_effects(False, False), sample.with_effects(True, forced)]
-            plain, fit = (run.fit("shadows", model, fit, BOUNCE_SCHEDULE) for model in models)
-            log_bayes_factor = (plain.value - fit.value) / 2
-            accepted = log_bayes_factor > -VERY_STRONG
-            decision = msgspec.structs.replace(decision, accepted=accepted, log_bayes_factor=log_bayes_factor)
-            if not accepted:
+        models = [sample.with_effects(False, False), sample.with_effects(True, forced)]
+        plain = run.fit("shadows", models[0], fit, ONE_STEP)
+        decision = compare_models(held_out_losses(models[0], plain.point), losses, CLEARLY_FOR)
+        if not decision.accepted:  # both continue from one fit
+            plain, fit = fit_both("shadows", models, fit, run)
+            decision = decide_by_likelihood(plain, fit, -VERY_STRONG)
+            if not decision.accepted:
                 return SolveState(plain, plain, decision)
     if bounces == "auto":
         selection = select_interreflection(sample, fit, run)
@@ -233,10 +229,19 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     return SolveState(fit, fit, decision, Decision(forced))
 
 
+def fit_both(phase: str, models: list[JointProblem], start: Fit, run: FitRunner) -> list[Fit]:
+    """Return the fits of two models from one start, under its hyperparameters."""
+    return [run.fit(phase, model, start, PAIR_SCHEDULE) for model in models]
+
+
+def decide_by_likelihood(simpler: Fit, richer: Fit, least: float) -> Decision:
+    """Keep the richer model if the log Bayes factor of the marginal likelihoods exceeds `least`."""
+    log_bayes_factor = (simpler.value - richer.value) / 2
+    return Decision(log_bayes_factor > least, log_bayes_factor=log_bayes_factor)
+
+
 def select_interreflection(sample: JointProblem, start: Fit, run: FitRunner) -> Selection:
     """Choose interreflection by the marginal likelihoods of two fits, with and without it, from one start.
-
-    Both have the hyperparameters of the start.
 
     Args:
         sample: Observations on which models are compared.
@@ -245,9 +250,8 @@ def select_interreflection(sample: JointProblem, start: Fit, run: FitRunner) -> 
     """
     models = [sample.with_effects(True, with_bounces) for with_bounces in (False, True)]
     phase = "shadows and bounces"
-    fits = [run.fit(phase, model, start, BOUNCE_SCHEDULE) for model in models]
-    log_bayes_factor = (fits[0].value - fits[1].value) / 2
-    decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
+    fits = fit_both(phase, models, start, run)
+    decision = decide_by_likelihood(fits[0], fits[1], VERY_STRONG)
     index = int(decision.accepted)
     return Selection(run.fit(phase, models[index], fits[index], AFTER_BOUNCES), [decision])
 

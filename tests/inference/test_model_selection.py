@@ -19,7 +19,6 @@ from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
-    CLEARLY_AGAINST,
     CLEARLY_FOR,
     LEAST_TONE_GAIN,
     VERY_STRONG,
@@ -144,7 +143,7 @@ def test_shadows_that_are_none_are_given_up(shaded):
     wrong = hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5))
     few = {"cells": 24, "observations": 150, "tone": "off"}
     result = solved(wrong, **few)
-    assert not result.shadows.accepted and result.shadows.margin < CLEARLY_AGAINST
+    assert not result.shadows.accepted and result.shadows.log_bayes_factor < -VERY_STRONG
     assert solved(wrong, **few, self_shadowing="on").shadows.accepted
 
 
@@ -255,9 +254,9 @@ def test_models_that_predict_the_same_are_equal_evidence(begun_rooms, monkeypatc
         for columns in (open_, {"place": lambda b: np.zeros((len(b), 3))})
     )
     shadows = select_effects(shaded, [fit], QUICK, FitRunner()).shadows
-    assert shadows.accepted and shadows.margin == pytest.approx(0, abs=1e-6)
+    assert shadows.accepted and shadows.log_bayes_factor == pytest.approx(0, abs=1e-6)
     guess = msgspec.structs.replace(fit, fitted=False)
-    assert select_effects(shaded, [guess], QUICK, FitRunner()).shadows.margin == pytest.approx(0, abs=1e-6)
+    assert select_effects(shaded, [guess], QUICK, FitRunner()).shadows.log_bayes_factor == pytest.approx(0, abs=1e-6)
     for decision in select_distances(central, fit, QUICK, FitRunner()).evidence:
         assert decision.log_bayes_factor == pytest.approx(0, abs=1e-6)
 

@@ -285,6 +285,7 @@ def test_every_part_reports_what_it_does(whole):
     _, events = whole
     visibilities = [event.phase for event in events]
     assert set(visibilities) <= set(ALL) and set(ALL) - {
+        "no shadows",
         "shadows and bounces",
         "background",
         "distances",
