@@ -153,7 +153,7 @@ def with_choices(state: SolveState, model: Model, lights: Sequence[str]) -> Solv
 
 
 def choose_effects(request: SolveRequest, state: SolveState) -> SolveState:
-    """Choose by held-out observations whether shadows are modelled, and by evidence whether interreflection is."""
+    """Choose by evidence whether shadows and interreflection are modelled."""
     problem = reliable_observations(request.problem)
     return select_effects(problem, request.starts, request.options, request.run)
 

@@ -187,7 +187,7 @@ def comparison_sample(problem: JointProblem, fit: Fit, options: SolveOptions) ->
 
 
 def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptions, run: FitRunner) -> SolveState:
-    """Choose shadows by held-out observations, and interreflection by marginal likelihood.
+    """Choose shadows by held-out observations or marginal likelihood, and interreflection by marginal likelihood.
 
     Args:
         problem: Observations with reliable normals.
