@@ -4,12 +4,20 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.materials import Point
 from factorlib.inference.normal_errors import DEVIATION, with_normal_errors
+from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_block
+from factorlib.scenes.joint_problems import (
+    MATERIALS,
+    observations_from_front,
+    random_light,
+    sphere_block,
+    sphere_normals,
+)
 
 OPERATOR = reflection_operator("closed_form")
 DRAWS = 400
@@ -64,3 +72,18 @@ def test_sure_normals_count_in_full_and_unsure_ones_less(problem):
     np.testing.assert_array_equal(none, 1.0)
     np.testing.assert_array_equal(sure, 1.0)
     assert np.all(unsure >= 1) and np.median(unsure) > 1.5
+
+
+def test_confidence_is_no_factor_on_the_weight():
+    """Weights of `urm` are pixels times confidence; the variance of normals counts it once."""
+    normal = sphere_normals(6)
+    blocks = [
+        blocks_of_observations(
+            observations_from_front(
+                normal, np.ones((len(normal), 3)), np.zeros(len(normal), int), ("red",), weight=sure, confidence=sure
+            ),
+            Noise(),
+        )[0]
+        for sure in (np.full(len(normal), 0.25), np.ones(len(normal)))
+    ]
+    np.testing.assert_allclose(blocks[0].inverse_sigma, blocks[1].inverse_sigma)
