@@ -18,6 +18,7 @@ import torch
 from factorlib.checkpoint import Checkpoint
 from factorlib.inference.fit import Fit, FitSchedule, fit_problem
 from factorlib.inference.materials import MaterialErrors, Point
+from factorlib.inference.normal_errors import scale_weights
 from factorlib.inference.problem import JointProblem
 from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.results.materials import Decision
@@ -86,6 +87,8 @@ class SolveState(msgspec.Struct, frozen=True):
         suns: Decision on each light's sun.
         observations: Largest number of a light's observations that materials are fitted to.
         errors: Standard errors of the materials of `fit`; empty before they are estimated.
+        light_factors: Factors of `factorlib.inference.normal_errors` on 1/σ of the observations that lights are fitted
+            to; empty before these fits.
     """
 
     fit: Fit
@@ -100,6 +103,7 @@ class SolveState(msgspec.Struct, frozen=True):
     suns: list[Decision] = []
     observations: int = 0
     errors: MaterialErrors = MaterialErrors()
+    light_factors: list[np.ndarray] = []
 
     @property
     def light_observations(self) -> int:
@@ -115,6 +119,11 @@ class SolveState(msgspec.Struct, frozen=True):
         widths = [each.accepted * (each.width or 1.0) for each in self.backgrounds]
         problem = problem.with_effects(self.shadows.accepted, self.interreflection.accepted)
         return problem.keep_backgrounds(widths).keep_grounds([each.accepted for each in self.grounds])
+
+    def light_sample(self, problem: JointProblem, seed: int) -> JointProblem:
+        """Return the observations that lights are fitted to with the materials fixed, under the chosen effects."""
+        sample = self.effective_problem(problem).subsample(self.light_observations, seed)
+        return scale_weights(sample, self.light_factors) if self.light_factors else sample
 
 
 class Solution(SolveState, frozen=True, kw_only=True):

@@ -39,7 +39,7 @@ from factorlib.inference.model_selection import (
     select_grounds,
     select_tone_curves,
 )
-from factorlib.inference.normal_errors import with_normal_errors
+from factorlib.inference.normal_errors import normal_error_factors, with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.splitting import split_cells
@@ -87,8 +87,7 @@ class SolveRequest(msgspec.Struct, frozen=True):
 
     def light_problem(self, state: SolveState) -> JointProblem:
         """Return the observations of any confidence that lights are fitted to, under the chosen effects."""
-        sample = state.effective_problem(self.problem).subsample(state.light_observations, self.options.seed)
-        return with_normal_errors(sample, state.fit.point)
+        return state.light_sample(self.problem, self.options.seed)
 
 
 def solve(
@@ -215,6 +214,8 @@ def apply_prior(request: SolveRequest, state: SolveState) -> SolveState:
 
 def fit_lights(request: SolveRequest, state: SolveState) -> SolveState:
     """Fit the lights to observations of any confidence, with the materials fixed."""
+    factors = normal_error_factors(request.light_problem(state), state.fit.point)
+    state = msgspec.structs.replace(state, light_factors=factors)
     fit = request.run.fit("lights", request.light_problem(state), state.fit, LIGHTS)
     return msgspec.structs.replace(state, fit=fit)
 

@@ -376,7 +376,8 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
 
     Materials adapt to the distances at which they are fitted.  Each light is therefore compared twice: with materials
     and lights fitted at infinity and at each of `CURVATURES`, and, if that favours a near light, with the materials of
-    the near lights.  The smaller Bayes factor counts.
+    the near lights.  The smaller Bayes factor counts.  A light that is less likely at one distance than at infinity is
+    not tried nearer.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
@@ -399,11 +400,16 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         lights = [msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature)) for k, light in pairs]
         return run.fit("distances", sample, start.with_lights(lights), schedule)
 
-    values = np.array([fit_with_curvatures(dict.fromkeys(candidates, c)).light_values for c in (0.0, *CURVATURES)])
-    log_bayes_factors = (values[0] - values[1:]) / 2
-    likely = softmax(log_bayes_factors, axis=0).T @ CURVATURES
+    far = np.array(fit_with_curvatures(dict.fromkeys(candidates, 0.0)).light_values)
+    log_bayes_factors = np.full((len(CURVATURES), len(far)), -np.inf)
+    supported = candidates
+    for row, curvature in zip(log_bayes_factors, CURVATURES, strict=True):
+        if supported:
+            values = np.array(fit_with_curvatures(dict.fromkeys(supported, curvature)).light_values)
+            row[supported] = (far - values)[supported] / 2
+            supported = [k for k in supported if row[k] > 0]
     factor = log_bayes_factors.max(0)
-    near = {k: float(likely[k]) for k in candidates if factor[k] > VERY_STRONG}
+    near = {k: float(softmax(log_bayes_factors[:, k]) @ CURVATURES) for k in candidates if factor[k] > VERY_STRONG}
     if near:
         near_fit = fit_with_curvatures(near)
         alternatives = (dict.fromkeys(near, 0.0), near)

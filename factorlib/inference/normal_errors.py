@@ -15,8 +15,11 @@ of them averages out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from factorlib.inference.blocks import Block
 from factorlib.inference.forward import Illumination
@@ -30,21 +33,32 @@ DEVIATION = np.radians(1.0)
 
 def with_normal_errors(problem: JointProblem, point: Point) -> JointProblem:
     """Return the problem whose observations have the variance (1), with the derivatives at a point."""
-    return problem.with_blocks(list(problem.spread(_widen, problem.illuminations(point))))
+    return scale_weights(problem, normal_error_factors(problem, point))
+
+
+def normal_error_factors(problem: JointProblem, point: Point) -> list[Float[np.ndarray, "n 3"]]:
+    """Return σ/σ' of (1) of every light's observations, with the derivatives at a point."""
+    return list(problem.spread(_factors, problem.illuminations(point)))
+
+
+def scale_weights(problem: JointProblem, factors: Sequence[Float[np.ndarray, "n c"]]) -> JointProblem:
+    """Return the problem with 1/σ of every light's observations multiplied by these factors."""
+    pairs = zip(problem.blocks, factors, strict=True)
+    return problem.with_blocks([msgspec.structs.replace(b, inverse_sigma=b.inverse_sigma * f) for b, f in pairs])
 
 
 def weighed_by_confidence(problem: JointProblem) -> JointProblem:
     """Return the problem whose observations have the share c of their weight, and not the variance (1)."""
-    weights = [1.0 if block.confidence is None else np.sqrt(block.confidence)[:, None] for block in problem.blocks]
-    pairs = zip(problem.blocks, weights, strict=True)
-    return problem.with_blocks([msgspec.structs.replace(b, inverse_sigma=b.inverse_sigma * w) for b, w in pairs])
+    ones = np.ones((1, 1))
+    factors = [ones if b.confidence is None else np.sqrt(b.confidence)[:, None] for b in problem.blocks]
+    return scale_weights(problem, factors)
 
 
-def _widen(illumination: Illumination) -> Block:
-    """Return the observations of one light with the variance (1)."""
+def _factors(illumination: Illumination) -> Float[np.ndarray, "n 3"]:
+    """Return σ/σ' of (1) of one light's observations."""
     block = illumination.block
     if block.confidence is None:
-        return block
+        return np.ones_like(block.inverse_sigma)
     variance = DEVIATION**2 * (block.confidence**-2.0 - 1)
     whitened = np.square(illumination.by_normal()).sum(2) * variance[:, None]
-    return msgspec.structs.replace(block, inverse_sigma=block.inverse_sigma / np.sqrt(1 + whitened))
+    return 1 / np.sqrt(1 + whitened)

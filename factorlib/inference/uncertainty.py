@@ -67,7 +67,6 @@ from factorlib.inference.likelihood import (
 from factorlib.inference.material_posterior import material_posterior
 from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, MaterialErrors, Materials, Point
-from factorlib.inference.normal_errors import with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
@@ -105,10 +104,11 @@ def estimate_uncertainty(
         options: Options of the user.
         tick: Called after each system of a light, one or (for the paper's solver) two a light.
     """
-    problem = solution.effective_problem(problem)
     errors = solution.errors
     if not len(errors.materials):  # of the paper's solver, which has no prior
-        sample = reliable_observations(problem).subsample(solution.observations, options.seed)
+        sample = reliable_observations(solution.effective_problem(problem)).subsample(
+            solution.observations, options.seed
+        )
         errors = Posterior(sample, solution.materials, solution.prior, tick).standard_errors()
     else:
         problem = problem.with_all_fitted()
@@ -116,8 +116,7 @@ def estimate_uncertainty(
     fitted = np.maximum(solution.fit.point.materials.rows(), LEAST_REFLECTANCE)
     in_gauge = errors.materials.rows() * (solution.point.materials.rows() / fitted)
     errors = msgspec.structs.replace(errors, materials=Materials.from_rows(in_gauge))
-    light_sample = problem.subsample(solution.light_observations, options.seed)
-    light_sample = with_normal_errors(light_sample, solution.fit.point)
+    light_sample = solution.light_sample(problem, options.seed)
     return errors, Posterior(light_sample, solution.fit, solution.prior, tick).relative_standard_errors()
 
 
