@@ -21,7 +21,6 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.inference.blocks import Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
