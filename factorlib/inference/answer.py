@@ -181,6 +181,8 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
             tone_chosen_by=dict(zip(lights, solution.tone)),
             distance={block.name: 1 / light.curvature for block, light in illuminations if light.curvature > 0},
             distance_chosen_by=dict(zip(lights, solution.distances)),
+            materials_fit=solution.materials.status[0] if solution.materials.status else None,
+            light_fits=dict(zip(lights, solution.fit.status)),
             started_from=started,
         )
 

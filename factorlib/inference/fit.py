@@ -40,6 +40,7 @@ from factorlib.inference.optimizer import Descent, LossReport
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.responses import ResponseCache
 from factorlib.light.prior import LightPrior
+from factorlib.results.materials import FitStatus
 
 RELIABLE = 0.6  # least confidence of a normal, as a share of its material's median
 DARK_NOISE = 0.2  # factor on the noise model's absolute part where normals are reliable
@@ -76,6 +77,7 @@ class Fit(msgspec.Struct, frozen=True):
         value: Objective, (1) of `factorlib.inference.optimizer`.
         light_values: Part of each light in it: minus twice its log marginal likelihood.
         fitted: True if a descent led to the point; False for a first guess.
+        status: Status of the last descent: one of materials and lights together, or one of each light.
     """
 
     point: Point
@@ -83,6 +85,7 @@ class Fit(msgspec.Struct, frozen=True):
     value: float = float("inf")
     light_values: list[float] = []
     fitted: bool = False
+    status: list[FitStatus] = []
 
     def with_lights(self, lights: list[Light]) -> Fit:
         """Return the start of another fit, in other lights."""
@@ -139,7 +142,7 @@ def fit_problem(
     with_table = partial(light_likelihood, prior=prior, materials_given=schedule.materials_fixed, tables=problem.tables)
     pairs = zip(problem.illuminations(Point(materials, start.point.lights)), hyperparameters, strict=True)
     likelihoods = list(problem.spread(lambda pair: with_table(*pair), list(pairs)))
-    state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
+    state, status = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
     estimate = partial(estimate_hyperparameters, least=schedule.least_temperature, factor=schedule.temperature_factor)
     for number, iterations in enumerate(schedule.descents):
         descent = msgspec.structs.replace(descent, prior=material_prior(one_tint=start.fitted or number > 0))
@@ -150,10 +153,11 @@ def fit_problem(
             illuminations = [likelihood.illumination for likelihood in state.likelihoods]
             state = state._replace(likelihoods=list(map(with_table, illuminations, hyperparameters)))
         if schedule.materials_fixed:
-            state = descent.descend_lights(state.likelihoods, state.theta, iterations)
+            state, status = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
             state = descent.linearise(state.likelihoods, state.theta)
-            state = descent.descend_jointly(balance_exposures(state, descent, problem.known), iterations)
+            state, joint = descent.descend_jointly(balance_exposures(state, descent, problem.known), iterations)
+            status = [joint]
             state = balance_exposures(state, descent, problem.known)
     if schedule.materials_fixed:  # values of systems are φ
         light_values = list(map(LightLikelihood.marginal, state.likelihoods, state.systems))
@@ -161,7 +165,8 @@ def fit_problem(
         materials = materials_from_unknowns(state.theta)
         light_values = [system.value for system in state.systems]
     value = sum(light_values) + state.prior.value
-    return Fit(Point(materials, [each.light for each in state.likelihoods]), hyperparameters, value, light_values, True)
+    point = Point(materials, [each.light for each in state.likelihoods])
+    return Fit(point, hyperparameters, value, light_values, True, status)
 
 
 def light_likelihood(

@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from factorlib.inference.blocks import Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
@@ -28,6 +29,13 @@ from factorlib.inference.problem import JointProblem
 # Standard deviation of a normal along a tangent, radians, times its confidence.  On data/eames, whose true normals are
 # known, the RMS along a tangent is 0.9, 1.2, 7.6 and 14 degrees where c is about 0.95, 0.75, 0.2 and 0.07.
 DEVIATION = np.radians(1.0)
+
+
+def normal_deviation(block: Block) -> Float[np.ndarray, " n"]:
+    """Return s of (1), radians, of each observation's normal; 0 without confidences."""
+    if block.confidence is None:
+        return np.zeros(len(block))
+    return DEVIATION * np.sqrt(np.maximum(block.confidence**-2.0 - 1, 0))
 
 
 def with_normal_errors(problem: JointProblem, point: Point) -> JointProblem:
@@ -58,6 +66,5 @@ def _factors(illumination: Illumination) -> Float[np.ndarray, "n 3"]:
     block = illumination.block
     if block.confidence is None:
         return np.ones_like(block.inverse_sigma)
-    variance = DEVIATION**2 * (block.confidence**-2.0 - 1)
-    whitened = np.square(illumination.by_normal()).sum(2) * variance[:, None]
-    return 1 / np.sqrt(1 + whitened)
+    slope = np.linalg.norm(illumination.by_normal(), axis=2)
+    return 1 / np.hypot(1, slope * normal_deviation(block)[:, None])

@@ -34,6 +34,7 @@ from factorlib.inference.likelihood import LightLikelihood, System, solve_choles
 from factorlib.inference.material_prior import MaterialPrior, PriorTerms, materials_from_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.inference.problem import Spread
+from factorlib.results.materials import FitStatus
 
 FLOOR = 1e-9  # share of the largest diagonal entry that is added to every diagonal entry
 LARGEST_CHANGE = np.array([0.7] * 6 + [0.1])  # largest change of a material's unknowns on one factorisation
@@ -145,31 +146,34 @@ class Descent(msgspec.Struct, frozen=True):
 
     def descend_lights(
         self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"], iterations: int
-    ) -> DescentState:
-        """Descend each light by itself with the materials fixed.
+    ) -> tuple[DescentState, list[FitStatus]]:
+        """Descend each light by itself with the materials fixed; return the state, and the status of each light.
 
         A light gets at most `iterations` minimisations by L-BFGS, each preconditioned by one factorisation of H.
         """
-        fitted = list(self.spread(lambda likelihood: descend_light(likelihood, iterations), likelihoods))
-        return self._state(theta, [likelihood for likelihood, _ in fitted], [system for _, system in fitted])
+        fits = list(self.spread(lambda likelihood: descend_light(likelihood, iterations), likelihoods))
+        fitted, systems, statuses = (list(parts) for parts in zip(*fits, strict=True))
+        return self._state(theta, fitted, systems), statuses
 
-    def descend_jointly(self, state: DescentState, iterations: int) -> DescentState:
-        """Return the state after at most `iterations` steps of materials and lights together.
+    def descend_jointly(self, state: DescentState, iterations: int) -> tuple[DescentState, FitStatus]:
+        """Return the state after at most `iterations` steps of materials and lights together, and the status.
 
         Each step costs one factorisation, also a rejected one.
         """
         damping = 0.0
-        for _ in range(iterations):
+        for number in range(1, iterations + 1):
             trial = self.linearise(*self._step(state, damping))
             gain = state.value - trial.value
             if gain > 0:
                 state = trial
                 damping = damping * DAMPING_DECREASE
-            if abs(gain) < TOLERANCE * abs(state.value) or damping > LARGEST_DAMPING:
-                break
+            if abs(gain) < TOLERANCE * abs(state.value):
+                return state, FitStatus("converged", number)
+            if damping > LARGEST_DAMPING:
+                return state, FitStatus("failed", number)
             if gain < 0:
                 damping = max(damping * DAMPING_INCREASE, FIRST_DAMPING)
-        return state
+        return state, FitStatus("limit", iterations)
 
     def linearise(self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"]) -> DescentState:
         """Return the normal equations of all lights at some materials, determinants included."""
@@ -237,13 +241,15 @@ def material_limits(theta: Float[np.ndarray, "m 7"], free: Bool[np.ndarray, " k"
     return np.reshape(limits, (2, theta.size))
 
 
-def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
-    """Minimise φ over one light with the materials fixed; return its likelihood and normal equations at the minimum.
+def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System, FitStatus]:
+    """Minimise φ over one light with the materials fixed.
+
+    The result is its likelihood and normal equations at the minimum, and the status.
 
     There are at most `iterations` minimisations by L-BFGS, each preconditioned by one factorisation of H.
     """
     system = likelihood.normal_equations(determinants=False)
-    for _ in range(iterations):
+    for number in range(1, iterations + 1):
 
         def objective(step: np.ndarray, start: LightLikelihood = likelihood) -> tuple[float, np.ndarray]:
             """Return φ and half its gradient."""
@@ -259,8 +265,8 @@ def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLi
         previous = system.value
         system = likelihood.normal_equations(determinants=False)
         if previous - system.value < TOLERANCE * abs(previous):
-            break
-    return likelihood, system
+            return likelihood, system, FitStatus("converged", number)
+    return likelihood, system, FitStatus("limit", iterations)
 
 
 def determinant_terms(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:

@@ -37,7 +37,7 @@ from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import CLEARLY_AGAINST, WEAKLY_FOR, Losses, Selection, compare_models, gains
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import SUN
-from factorlib.results.materials import Decision
+from factorlib.results.materials import Decision, FitStatus
 
 # Radii about the brightest direction: of the cells that a sun replaces, and of those whose radiance they take.
 DISC_RADIUS, RING_RADIUS = np.radians([14, 28])
@@ -72,37 +72,38 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
 
     def fit_anew(
         numbers: list[int], lights: list[Light], schedule: FitSchedule = AROUND_SUNS
-    ) -> tuple[list[Illumination], list[Hyperparameters]]:
-        """Fit some lights, by their numbers; return their illuminations and hyperparameters."""
+    ) -> list[tuple[Illumination, Hyperparameters, FitStatus]]:
+        """Fit some lights, by their numbers; return their illuminations, hyperparameters and status."""
         chosen = problem.select_lights(numbers)
         start = Fit(Point(fit.point.materials, lights), [fit.hyperparameters[k] for k in numbers])
         result = run.fit("suns", chosen, start, schedule)
-        return chosen.tabulated(result.point), result.hyperparameters
+        return list(zip(chosen.tabulated(result.point), result.hyperparameters, result.status, strict=True))
 
     # cells are fitted anew around each sun, and as much without it; for one step, and if that supports the sun, further
     for schedule, share in ((ONE_STEP, 0.5), (AROUND_SUNS, 1.0)):
-        alone, _ = fit_anew(changed, [fit.point.lights[k] for k in changed], schedule)
-        with_suns, weights = fit_anew(changed, [candidates[k] for k in changed], schedule)
+        alone = fit_anew(changed, [fit.point.lights[k] for k in changed], schedule)
+        with_suns = fit_anew(changed, [candidates[k] for k in changed], schedule)
         for k, cells, sun in zip(changed, alone, with_suns, strict=True):
-            evidence[k] = accept_sun(cells, sun, share)
-        pairs = zip(changed, with_suns, weights, strict=True)
-        kept = {k: (sun, its_weights) for k, sun, its_weights in pairs if evidence[k].accepted}
+            evidence[k] = accept_sun(cells[0], sun[0], share)
+        kept = {k: sun for k, sun in zip(changed, with_suns, strict=True) if evidence[k].accepted}
         changed = list(kept)
         if not kept:
             return Selection(fit, evidence)
     # a wide lobe in place of each accepted sun
     replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
-    wide, _ = fit_anew(changed, list(problem.spread(replace_widely, [without_suns[k] for k in changed])))
+    wide = fit_anew(changed, list(problem.spread(replace_widely, [without_suns[k] for k in changed])))
     lights = list(fit.point.lights)
     hyperparameters = list(fit.hyperparameters)
-    for (k, (sun, its_weights)), with_wide_lobe in zip(kept.items(), wide, strict=True):
-        decision = compare_illuminations(with_wide_lobe, sun, CLEARLY_AGAINST)
+    status = list(fit.status)
+    for (k, sun), with_wide_lobe in zip(kept.items(), wide, strict=True):
+        decision = compare_illuminations(with_wide_lobe[0], sun[0], CLEARLY_AGAINST)
         if decision.accepted:
-            lights[k] = sun.light
-            hyperparameters[k] = its_weights
+            illumination, hyperparameters[k], status[k] = sun
+            lights[k] = illumination.light
         else:
             evidence[k] = decision
-    return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
+    fit = msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters, status=status)
+    return Selection(fit, evidence)
 
 
 def replace_brightest(illumination: Illumination, sharpness: float) -> Light:

@@ -224,7 +224,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
             start = Point(self.fit.point.materials, [self.fit.point.lights[k]])
             (illumination,) = problem.without_held_out().illuminations(start)
             likelihood = light_likelihood(illumination, self.fit.hyperparameters[k], self.prior, materials_given=True)
-            likelihood, system = descend_light(likelihood, LIGHT_STEPS)
+            likelihood, system, _ = descend_light(likelihood, LIGHT_STEPS)
             losses = held_out_losses(problem, Point(start.materials, [likelihood.light]))
             tick()
             return likelihood.marginal(system), losses

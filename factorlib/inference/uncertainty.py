@@ -23,13 +23,11 @@ Variables   S comes from the system of φ (`factorlib.inference.likelihood`), wi
             to their logarithms, a zero reflectance would look exactly known.
 
 Normals     On thin and coarse parts normals are wrong together, which residuals do not show: lights and roughness
-            explain them.  A normal of confidence c (`factorlib.align.reliability`) has the variance
+            explain them.  Let the normals of one material in one photo turn by their deviation s, (1) of
+            `factorlib.inference.normal_errors`, about each axis, all together.  Let d_k be the change of the score by
+            turn k, less the part that the lights absorb.  Materials then have the further covariance
 
-                NORMAL_ERROR² (1/c − 1)                                                                              (2)
-
-            beyond that of a sure one.  Let the normals of one material in one photo turn by it about each axis, all
-            together, and let d_k be the change of the score by turn k, less the part that the lights absorb.  Materials
-            then have the further covariance S⁻¹ (Σ_k d_k d_kᵀ) S⁻¹.
+                S⁻¹ (Σ_k d_k d_kᵀ) S⁻¹                                                                               (2)
 
 Model       More observations do not remove errors of the model itself, mostly of the mesh.  MODEL_ERROR is therefore
             added in quadrature, in proportion to the residuals.
@@ -67,6 +65,7 @@ from factorlib.inference.likelihood import (
 from factorlib.inference.material_posterior import material_posterior
 from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, MaterialErrors, Materials, Point
+from factorlib.inference.normal_errors import normal_deviation
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
@@ -81,12 +80,10 @@ ABSOLUTE = (
 )
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
 # Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
-# roughness.  With them and NORMAL_ERROR about 68 % of true values lie within one standard error on the sets that
+# roughness.  With them and turns of normals about 68 % of true values lie within one standard error on the sets that
 # settings were chosen on (`studies.measured.standard_errors`).
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.06])
 LIGHT_ERROR = 0.7
-# Standard deviation of normals of (2), radians, chosen on made chairs whose true normals are known.
-NORMAL_ERROR = np.radians(1.5)
 COVERAGE_ROWS = 32  # rows of the maps of a light's relative standard errors
 LARGEST_RELATIVE_ERROR = 1000.0  # upper limit in these maps
 
@@ -241,20 +238,17 @@ def by_unknowns(materials: Materials) -> Float[np.ndarray, "m 7"]:
 
 
 def normal_turns(likelihood: LightLikelihood) -> list[Grouping]:
-    """Return the changes of one light's residuals by turns of normals about each axis, grouped by photo and material.
-
-    Turns are the standard deviation of (2).
-    """
+    """Return the changes of one light's residuals by turns of normals about each axis, grouped by photo and material."""
     block = likelihood.illumination.block
     if block.confidence is None:
         return []
-    unsure = np.sqrt(1 / block.confidence - 1)
     weight = likelihood.illumination.root_weights(
         likelihood.illumination.residuals(), likelihood.loss, likelihood.temperature
     )
     slopes = likelihood.illumination.by_normal() * weight[:, :, None]
     group = np.unique(np.column_stack([block.photo, block.material]), axis=0, return_inverse=True)[1].reshape(-1)
-    turned = [NORMAL_ERROR * unsure[:, None] * np.cross(axis, block.normal) for axis in np.eye(3)]
+    deviation = normal_deviation(block)[:, None]
+    turned = [deviation * np.cross(axis, block.normal) for axis in np.eye(3)]
     return [Grouping(group, np.einsum("ncx,nx->nc", slopes, turn)) for turn in turned]
 
 

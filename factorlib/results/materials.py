@@ -159,8 +159,21 @@ class WarmStart(msgspec.Struct, frozen=True):
     illuminations: list[str]
 
 
+class FitStatus(msgspec.Struct, frozen=True):
+    """End of an iterative fit.
+
+    Attributes:
+        outcome: converged: the last step lowered the objective by less than its tolerance; limit: the last allowed step
+            lowered it by more; failed: no step lowered it
+        steps: number of steps
+    """
+
+    outcome: Literal["converged", "limit", "failed"]
+    steps: int
+
+
 class Model(msgspec.Struct, frozen=True):
-    """Choices of the model, and the evidence for them.
+    """Choices of the model, the evidence for them, and the status of the fits.
 
     Attributes:
         lobes: number of lobes, or cells, by illumination
@@ -176,6 +189,8 @@ class Model(msgspec.Struct, frozen=True):
         tone_chosen_by: decision on tone curves, by illumination
         distance: distance of each light that is not at infinity, in RMS distances of a photo's points from their middle
         distance_chosen_by: decision on the distance, by illumination
+        materials_fit: status of the last fit of materials and lights together; None of the paper's solver
+        light_fits: status of the last fit of each light with the materials given, by illumination
     """
 
     solver: Literal["joint", "paper"] = "joint"
@@ -195,6 +210,8 @@ class Model(msgspec.Struct, frozen=True):
     tone_chosen_by: dict[str, Decision] = {}
     distance: dict[str, Positive] = {}
     distance_chosen_by: dict[str, Decision] = {}
+    materials_fit: FitStatus | None = None
+    light_fits: dict[str, FitStatus] = {}
     started_from: WarmStart | UnsetType = UNSET
 
     def curvature(self, illumination: str) -> float:

@@ -28,6 +28,7 @@ from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import constant_light
 from factorlib.reflection import reflection_operator
+from factorlib.results.materials import FitStatus
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block
 from tests.inference.made_lights import (
     FEW,
@@ -224,13 +225,17 @@ def test_an_unknown_at_its_bound_stops_no_other(exponents):
     toned = tone.curve(block.radiance, np.array(exponents)[block.photo][:, None])
     block = msgspec.structs.replace(block, radiance=toned, inverse_sigma=1 / np.hypot(0.05, 0.05 * toned))
     start = msgspec.structs.replace(constant_light(block, MATERIALS, 60), log_tone=np.zeros(2))
-    end, system = descend_light(likelihood(JointProblem([block], OPERATOR), start), 8)
+    end, system, status = descend_light(likelihood(JointProblem([block], OPERATOR), start), 8)
     low, high = np.log(TONE_RANGE)
     inside = np.append(
         np.ones(start.unknowns - 2, bool), np.abs(end.light.log_tone - (low + high) / 2) < 0.999 * (high - low) / 2
     )
     slope = system.light_gradient[inside]
     assert not inside.all() and slope @ np.linalg.solve(system.light_hessian[np.ix_(inside, inside)], slope) < 1
+    # its status says so, and that one step is too few
+    assert status.outcome == "converged" and 1 < status.steps < 8
+    *_, early = descend_light(likelihood(JointProblem([block], OPERATOR), start), 1)
+    assert early == FitStatus("limit", 1)
 
 
 def test_where_a_descent_ends_the_likelihood_has_no_slope_left():
@@ -258,6 +263,9 @@ def test_where_a_descent_ends_the_likelihood_has_no_slope_left():
             slope[one.places] += one.material_gradient
         sizes.append(np.abs(slope).max())
     assert sizes[1] < 0.05 * sizes[0], sizes
+    assert [end.outcome for end in result.status] == ["converged"]
+    early = fit_problem(problem, start, PRIOR, FitSchedule(descents=(1,)))
+    assert early.status == [FitStatus("limit", 1)]
 
 
 # ──  ────────────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -17,12 +17,12 @@ from factorlib.inference.lights import Light
 from factorlib.inference.material_prior import MaterialPrior, PriorTerms, material_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, Point
 from factorlib.inference.misfit import unexplained_shares
+from factorlib.inference.normal_errors import DEVIATION
 from factorlib.inference.optimizer import Descent, step_light
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import insert_known
 from factorlib.inference.uncertainty import (
     LARGEST_RELATIVE_ERROR,
-    NORMAL_ERROR,
     WIDTHS,
     Posterior,
     by_unknowns,
@@ -86,7 +86,7 @@ def test_a_descent_with_known_unknowns_is_that_of_a_prior_that_holds_them(monkey
     one, ends = likelihood(problem, begun(problem, 40).point.lights[0], START), []
     for of, moving in ((prior, free), (stiff, np.ones(21, bool))):
         descent = Descent(of, problem.spread, lambda loss: None, moving)
-        ends.append(descent.descend_jointly(descent.linearise([one], theta), 40))
+        ends.append(descent.descend_jointly(descent.linearise([one], theta), 40)[0])
     assert (ends[0].theta.reshape(-1)[~free] == theta.reshape(-1)[~free]).all() and (ends[0].theta != theta).any()
     np.testing.assert_allclose(ends[0].theta, ends[1].theta, atol=5e-3)
 
@@ -321,7 +321,7 @@ def test_errors_of_normals_are_how_far_materials_move_when_normals_turn(monkeypa
                 change = np.zeros(first[-1])
                 for place, old, new in zip(places, before, gradients(blocks), strict=True):
                     change[place] += new - old
-                step = np.linalg.solve(hessian, change)[:21] / angle * NORMAL_ERROR * np.sqrt(1 / c - 1)
+                step = np.linalg.solve(hessian, change)[:21] / angle * DEVIATION * np.sqrt(1 / c**2 - 1)
                 expected += np.outer(step, step)
     expected = project_to_gauge(expected * np.outer(values, values), MATERIALS, problem)
     given = posterior.covariances()[2]
