@@ -238,7 +238,7 @@ def by_unknowns(materials: Materials) -> Float[np.ndarray, "m 7"]:
 
 
 def normal_turns(likelihood: LightLikelihood) -> list[Grouping]:
-    """Return the changes of one light's residuals by turns of normals about each axis, grouped by photo and material."""
+    """Return the changes of a light's residuals by turns of normals about each axis, grouped by photo and material."""
     block = likelihood.illumination.block
     if block.confidence is None:
         return []
