@@ -16,11 +16,13 @@ class SolveOptions(Struct, frozen=True):
     cells: Annotated[int, Meta(ge=12, le=1600)] = 400
     """Number of a light's cells before any of them splits; 400 cells are 10° apart."""
     splittings: Annotated[int, Meta(ge=0, le=8)] = 3
-    """Largest number of splittings.  Each splits the 24 cells of a light with most energy in about four, if the
-    marginal likelihood supports it very strongly (log Bayes factor over 5)."""
+    """Largest number of splittings before materials are fitted, and of those after it.  Each splits the 24 cells of a
+    light with most energy in about four, if the marginal likelihood supports it very strongly (log Bayes factor over
+    5)."""
     observations: Annotated[int, Meta(ge=50)] = 1000
     """Largest number of a light's observations that materials are fitted to, drawn evenly; eight times as many if
-    they are explained closely after the first accepted splitting.  Lights alone are fitted to twice as many."""
+    they are explained closely (mean robust loss under 0.5) and cells may split.  Lights alone are fitted to twice as
+    many."""
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     """Shadows of the meshes; auto: on, unless the marginal likelihood is very strongly against them (log Bayes factor
     below -5)."""

