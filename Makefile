@@ -86,7 +86,7 @@ help-all:
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'
 	@echo 'make plan | why | status DATASET=…   list the steps that would run; every reason; progress and warnings'
 	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'
-	@echo 'make photos DATASET=mychair PHOTOS=… [MESHES=…] [MATTE=<file.onnx>]   the same with automatic masks, cameras and a hull'
+	@echo 'make photos DATASET=mychair PHOTOS=… [MESHES=…] [MATTE=<file.onnx>] [WHOLE=1]   the same with automatic masks, cameras and a hull'
 	@echo 'make label DATASET=mychair [PORT=…]   draw masks in a browser: boxes, clicks, brush (docs/dataset.md)'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
 	@echo 'make logs DATASET=… STAGE=… PHOTO=…  time, peak memory, versions and warnings of results'

@@ -99,6 +99,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--masks": {"key": "MASKS", "type": _path, "help": "folder of masks"},
     "--meshes": {"key": "MESHES", "type": _path, "help": "folder of meshes"},
     "--matte": {"key": "MATTE", "type": _path, "help": "ONNX file of a matting network, otherwise U2-Net small"},
+    "--whole": {
+        "key": "WHOLE",
+        "action": "store_true",
+        "help": "take the thing for one material, whatever its colours",
+    },
     "--port": {"key": "PORT", "type": int, "help": "port on 127.0.0.1, otherwise a free one"},
     "--out": {"key": "OUT", "type": _path, "help": "zip file to write, otherwise <dataset>.zip in this folder"},
     "--sheet": {"key": "SHEET", "action": "store_true", "help": "also draw photos, labels and meshes"},
@@ -158,8 +163,9 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
     "new": ("--dataset --photos --masks --meshes",
             lambda a: verbs.begin(project(), dataset_of(a), a.photos, a.meshes, a.masks),
             "Create data/<name> with a dataset.yaml from your own photos, masks and meshes."),
-    "photos": ("--dataset --photos --meshes --matte",
-               lambda a: verbs.begin(project(), dataset_of(a), a.photos, a.meshes, verbs.MatteFile(a.matte)),
+    "photos": ("--dataset --photos --meshes --matte --whole",
+               lambda a: verbs.begin(
+                   project(), dataset_of(a), a.photos, a.meshes, verbs.EstimatedMasks(a.matte, a.whole)),
                "Create data/<name> from photographs alone: automatic masks, cameras, a visual hull."),
     "label": ("--dataset --port", lambda a: verbs.label_masks(project(), dataset_of(a), a.port or 0),
               "Draw masks on a page in the browser, served on this machine alone until Ctrl-C."),

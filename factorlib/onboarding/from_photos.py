@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import distance_transform_edt
 
 from factorlib.align.silhouette import with_prior_focal
 from factorlib.dataset.paths import Refusal
@@ -30,6 +31,7 @@ from factorlib.jsonfile import write_json
 from factorlib.labels.label_image import describe_specks
 from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
+from factorlib.onboarding.parts import find_parts
 from factorlib.onboarding.photo_folder import Cameras
 from factorlib.shapes.hull import agreement, agreements, focal_by_hull, hull_box
 from factorlib.shapes.lathe import is_revolved
@@ -41,6 +43,8 @@ OUTLINE_PIXELS = 40_000  # pixels of a photo whose outline is asked for its symm
 DISAGREES = 0.8  # a mask's agreement with the hull of the others, as a share of the median one, below which it is named
 LENS_ERROR = 0.005  # greatest error of a lens by two coefficients, in widths of the image
 MARGINS = (0.05, 0.15)  # margins about the hull's box, in its longer side, of the crops that masks are estimated from
+LEAST_VIEWS = 4  # photos of a walk around a thing, from which parts are proposed
+MOST_VIEWS = 40  # photos that parts are found from
 Report = Callable[[float, str], None]
 SHAPE = (
     "photos without known cameras do not tell the shape, and too few of them overlap to find cameras: in `meshes`, "
@@ -89,7 +93,7 @@ class View(msgspec.Struct, frozen=True):
 
 
 def dataset_from_photos(
-    target: Path, photos: Path, meshes: Path | None, model: Path | None, report: Report
+    target: Path, photos: Path, meshes: Path | None, model: Path | None, report: Report, whole: bool = False
 ) -> tuple[list[str], list[str]]:
     """Write the dataset of a folder of photographs, and return what is still missing, and what to look at, in words.
 
@@ -99,6 +103,7 @@ def dataset_from_photos(
         meshes: folder of meshes; None: the shape is carved from the masks
         model: ONNX file of a matting network; None: that of the extra `masks`
         report: called with the completed share, from 0 to 1, and the current activity
+        whole: True for a thing of one material, whose colours are not looked at
 
     Raises:
         InputError: As `new_dataset` does, and if a photo needs a network that is not installed.
@@ -116,14 +121,18 @@ def dataset_from_photos(
         elif not meshes:
             cameras, outlines = cameras_of_motion(visible, report)
         views, outlines = refine_masks(
-            views, outlines, model, folder, lambda share, text: report(0.9 + share / 10, text)
+            views, outlines, model, folder, lambda share, text: report(0.9 + share / 20, text)
         )
+        labelled = []
+        if not (whole or meshes) and len(outlines) >= LEAST_VIEWS:
+            labelled = label_parts(outlines, images, folder, lambda share: report(0.95 + share / 20, "parts by colour"))
         if unknown := not cameras.source and not meshes:
             cameras = outlined_shape(visible, report)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
     return missing + [SHAPE] * (unknown and not cameras.revolved), [
         NAMES,
         *cameras.notes,
+        *labelled,
         *doubtful_masks(views, outlines),
     ]
 
@@ -383,6 +392,47 @@ def mask_within(
     mask = np.zeros(view.size, bool)
     mask[factor * top : factor * top + height, factor * left : factor * left + width] = foreground(matte)
     return mask, doubt
+
+
+def label_parts(
+    outlines: list[Outline], paths: Mapping[str, Path], folder: Path, report: Callable[[float], None]
+) -> list[str]:
+    """Write the labels of parts by colour into the masks, and return what to look at, in words.
+
+    Args:
+        outlines: outlines by known cameras
+        paths: path of each photo
+        folder: the folder of the masks, as `read_views` writes it
+        report: called with the completed share
+    """
+
+    def read(name: str) -> Float[np.ndarray, "h w 3"]:
+        """Return the linear radiance of a photo, averaged down as its outline; NaN where it is clipped."""
+        opened = open_photo(paths[name], "PHOTOS")
+        photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), paths[name])
+        return np.where(photo.clipped.any(2, keepdims=True), np.nan, photo.radiance)
+
+    step = -(-len(outlines) // MOST_VIEWS)
+    try:
+        surface = find_parts(outlines[::step], read, report)
+    except InputError:  # no hull
+        return []
+    if len(surface.shares) == 1:
+        return []
+    for outline in outlines:
+        file = folder / "masks" / f"{outline.photo}.png"
+        mask = read_inside(file, "PHOTOS")
+        labels = surface.label(outline, read(outline.photo))
+        # the nearest label where the mask of the file is larger, at the size of the file
+        nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+        rows, columns = (np.arange(n) * m // n for n, m in zip(mask.shape, labels.shape, strict=True))
+        labels = labels[tuple(nearest)][rows][:, columns]
+        write_png(file, np.where(mask, labels, 0)[..., None].astype(np.uint8))
+    shares = ", ".join(f"label_{k} {share:.0%}" for k, share in enumerate(surface.shares, start=1))
+    return [
+        f"{len(surface.shares)} parts by colour are proposed as materials ({shares} of the surface): look at the "
+        "contact sheet and give them names in dataset.yaml; WHOLE=1 takes the thing for one material"
+    ]
 
 
 def agreements_of(outlines: list[Outline]) -> dict[str, float]:

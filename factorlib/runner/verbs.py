@@ -259,14 +259,20 @@ def _draw_sheet(project: Project, folder: Path) -> None:
     print(f"  contact sheet: {project.short_path(path)}")
 
 
-class MatteFile(NamedTuple):
-    """ONNX file of a matting network; None for that of the extra `masks`."""
+class EstimatedMasks(NamedTuple):
+    """Options of estimated masks.
 
-    path: Path | None
+    Attributes:
+        network: ONNX file of a matting network; None for that of the extra `masks`.
+        whole: True for a thing of one material, whose colours are not looked at.
+    """
+
+    network: Path | None
+    whole: bool
 
 
 def begin(
-    project: Project, dataset: str, photos: Path | None, meshes: Path | None, masks: Path | MatteFile | None
+    project: Project, dataset: str, photos: Path | None, meshes: Path | None, masks: Path | EstimatedMasks | None
 ) -> int:
     """Create a dataset from folders of files, and print what is left to do.
 
@@ -275,7 +281,7 @@ def begin(
         dataset: name of the dataset, or its path
         photos: folder of photos
         meshes: folder of meshes, or None
-        masks: folder of masks, or None; a `MatteFile`: masks and cameras are estimated
+        masks: folder of masks, or None; `EstimatedMasks`: masks and cameras are estimated
     """
     if photos is None:
         cure = "add PHOTOS=<folder>, and for `make new` MASKS=<folder> and MESHES=<folder> if you have these"
@@ -284,11 +290,11 @@ def begin(
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     with ended_by_signals(folder):
         notes = []
-        if isinstance(masks, MatteFile):
+        if isinstance(masks, EstimatedMasks):
             with _shown("photos") as progress:  # modules by name: they are science
                 create = import_module("factorlib.onboarding.from_photos").dataset_from_photos
                 missing, notes = create(
-                    folder, photos, meshes, masks.path, lambda share, text: progress(share, 1, text)
+                    folder, photos, meshes, masks.network, lambda share, text: progress(share, 1, text), masks.whole
                 )
         else:
             missing = import_module("factorlib.dataset_draft").new_dataset(folder, photos, masks, meshes)
@@ -300,7 +306,7 @@ def begin(
             _draw_sheet(project, folder)
         except InputError as fault:
             print(f"  no contact sheet: {fault}")
-        if isinstance(masks, MatteFile) and not missing:
+        if isinstance(masks, EstimatedMasks) and not missing:
             return validate(project, dataset, [])
         drawn = f"name your materials in it, then {project.command('label', dataset)}, then "
         first = drawn if any("make label" in line for line in missing) else ""

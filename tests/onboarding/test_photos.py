@@ -101,7 +101,9 @@ def test_a_mask_of_another_thing_is_found_again_where_the_other_photos_show_the_
     lens = {"fl_x": CAMERA.focal, "w": CAMERA.width, "h": CAMERA.height}
     cameras.write_text(json.dumps(json.loads(cameras.read_text()) | lens))
     monkeypatch.setattr("factorlib.onboarding.from_photos.MatteModel", lambda path: brightest)
-    _, notes = dataset_from_photos(cut_outs / "mine", cut_outs / "capture", None, None, lambda share, text: None)
+    _, notes = dataset_from_photos(
+        cut_outs / "mine", cut_outs / "capture", None, None, lambda share, text: None, whole=True
+    )
     for name, alpha in bodies.items():
         mask = np.asarray(Image.open(cut_outs / "mine" / "masks" / f"{name}.png")) > 0
         assert (mask & alpha).sum() > 0.98 * (mask | alpha).sum(), name
