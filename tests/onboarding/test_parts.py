@@ -18,7 +18,7 @@ from tests.shapes.outlines import looking_from
 
 CAMERA = Camera(160, 120, 320.0, (80.0, 60.0))
 POSES = [looking_from(elevation, 36 * k) for k, elevation in enumerate([10, 40, 25, 5, 50, 15, 35, 20, 45, 30])]
-SUN = unit(np.array([[0.5, 0.8, 0.4]]))[0]
+SUN = unit(np.array([[0.3, 1.0, 0.2]]))[0]
 JUG = photographed_mesh("jug")
 COLOURS = np.array([[0.5, 0.1, 0.08], [0.6, 0.6, 0.55], [0.1, 0.2, 0.4]])
 
@@ -39,12 +39,12 @@ def irradiance() -> np.ndarray:
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(o3d.core.Tensor(JUG.vertices.astype("f4")), o3d.core.Tensor(JUG.faces.astype("u4")))
     total = np.zeros((len(centre), 3))
-    sky = [(direction, np.array([0.6, 0.8, 1.0]) / 15) for direction in fibonacci_sphere(60) if direction[1] > 0]
+    sky = [(direction, np.array([0.6, 0.8, 1.0]) / 60) for direction in fibonacci_sphere(60) if direction[1] > 0]
     for direction, colour in [(SUN, np.array([3.0, 2.8, 2.4])), *sky]:
         rays = np.hstack([centre + 0.003 * normal, np.tile(direction, (len(centre), 1))]).astype("f4")
         free = ~scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
         total += (np.maximum(normal @ direction, 0) * free)[:, None] * colour
-    return total + 0.1
+    return total + 0.02
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def photo(name: str, radiance: np.ndarray, faces: list[np.ndarray], exposures: n
     return np.where(faces[k][..., None] >= 0, radiance[faces[k]] * exposures[k], 0.05) * noise
 
 
-@pytest.mark.parametrize("exposed", [0.0, 0.3])
+@pytest.mark.parametrize("exposed", [0.0, 0.7])
 def test_materials_in_a_sun_are_found_whatever_the_exposures(lit, exposed):
     outlines, faces, light = lit
     truth = regions(3)
@@ -80,6 +80,7 @@ def test_materials_in_a_sun_are_found_whatever_the_exposures(lit, exposed):
     read = partial(photo, radiance=light * COLOURS[truth], faces=faces, exposures=exposures)
     surface = find_parts(outlines, read)
     assert len(surface.shares) == 3 and list(surface.shares) == sorted(surface.shares, reverse=True)
+    assert np.sqrt(np.diag(surface.parts.covariance)).max() < 0.26  # 0.23 at one exposure
     for k in (0, 4, 7):
         label = surface.label(outlines[k], read(str(k)))
         inside = faces[k] >= 0
