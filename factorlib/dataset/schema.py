@@ -194,7 +194,8 @@ class CameraSource(_Format, frozen=True):
         sfm: estimate cameras from the photos by structure from motion
         images: image in the source (BOP: its id) by photo, if the file's name does not identify it
         world_from_object: placement of an object in the source's world, which gives its pose
-        world_from_camera: fix lights to the source's world by its rotations
+        world_from_camera: fix lights to the source's world by its rotations, turned upright
+        up: the world's axis that points up; None: that of the cameras' common horizon
         obj_ids: BOP's obj_id by mesh
     """
 
@@ -205,6 +206,7 @@ class CameraSource(_Format, frozen=True):
     images: dict[str, str | int] = {}
     world_from_object: dict[str, Similarity] = {}
     world_from_camera: bool = False
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     obj_ids: dict[str, int] = {}
     mesh_unit_mm: Unit = 1.0
 

@@ -343,19 +343,19 @@ class PartModel(msgspec.Struct, frozen=True):
 
     def fit(self, probability: Float[np.ndarray, "p k"], rounds: int = 4) -> Parts:
         """Return the fit of parts and light by turns, from the probabilities of parts."""
-        irradiance = None
         reflectance = np.zeros((probability.shape[1], 3))
         if reflectance.shape[0] > 1:
             weighted = probability * self.weight[:, None]
             reflectance = weighted.T @ self.ambient / np.maximum(weighted.sum(0), 1e-12)[:, None]
-        for _ in range(rounds):
-            irradiance = self.fit_light(probability @ reflectance, irradiance)
+        irradiance = self.log_radiance - probability @ reflectance
+        for number in range(rounds):
+            irradiance = self.fit_light(probability @ reflectance, irradiance, 2 if number else 6)
             residual = self.log_radiance - irradiance
             probability, value, reflectance, covariance = self.mixture(residual, probability)
         return Parts(reflectance, covariance, probability, irradiance, value)
 
     def fit_light(
-        self, log_reflectance: Float[np.ndarray, "p 3"], start: Float[np.ndarray, "p 3"] | None
+        self, log_reflectance: Float[np.ndarray, "p 3"], start: Float[np.ndarray, "p 3"], iterations: int
     ) -> Float[np.ndarray, "p 3"]:
         """Return log Σ T l of the light that explains the patches of these reflectances.
 
@@ -363,13 +363,14 @@ class PartModel(msgspec.Struct, frozen=True):
 
         Args:
             log_reflectance: log ρ of each patch.
-            start: log Σ T l₀; None for a first fit.
+            start: log Σ T l₀.
+            iterations: Number of iterations.
         """
         result = np.empty_like(self.log_radiance)
         for c in range(3):
             target = np.exp(self.log_radiance[:, c] - log_reflectance[:, c])
-            predicted = target if start is None else np.exp(start[:, c])
-            for _ in range(6 if start is None else 2):
+            predicted = np.exp(start[:, c])
+            for _ in range(iterations):
                 trust = 1 / (1 + np.square(np.log(target / predicted) / LIGHT_DEVIATION))
                 root = np.sqrt(self.weight * trust / (target * predicted))
                 A = root[:, None] * self.transport

@@ -15,6 +15,7 @@ from factorlib.align.input_checks import camera_of_photo, convert_intrinsics
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import ExternalCamera, ObjectsSlice
 from factorlib.dataset.slices import dataset_slice
+from factorlib.dataset.sources.external_cameras import upright_turn
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.results.photos import PhotoFacts
 from tests.faults.sample import put
@@ -101,9 +102,12 @@ def test_lights_are_fixed_to_the_models_world_where_asked_for(folder):
     assert all(photo.world_from_camera is None for photo in read(folder, {"colmap": "sparse/0"}).spec.photos)
     fixed = {"colmap": "sparse/0", "world_from_camera": True}
     facts = dataset_slice(read(folder, fixed), "light", "hall").facts
-    assert np.allclose(np.array(facts["world_from_camera"]) @ [0, 0, 1], images["hall.png"].viewing_direction())
+    turn = upright_turn([np.array(image.cam_from_world().inverse().rotation.matrix()) for image in images.values()])
+    assert np.allclose(np.array(facts["world_from_camera"]) @ [0, 0, 1], turn @ images["hall.png"].viewing_direction())
     own = read(folder, fixed, photo={"world_from_camera": TURN.tolist()})
     assert np.allclose(own.spec.photos[0].world_from_camera, TURN)
+    matrix = images["attic.png"].cam_from_world().inverse().rotation.matrix()
+    assert np.allclose(own.spec.photos[1].world_from_camera, matrix)  # beside one that stands there, none is turned
     colmap(folder, names=("hall.png",))
     refused(folder, fixed, "photos[1].world_from_camera", "only one of", photo={"illumination": "attic"})
 
@@ -164,7 +168,29 @@ def test_what_is_right_and_up_of_an_opengl_camera_is_right_and_up_in_the_photo(f
     for name, point in (("hall", [1.0, 2.0, 0.0]), ("attic", [0.0, 2.0, -1.0])):
         assert np.allclose(pixels(external[name], np.array([point])), [[104 + 60, 71 - 120]])
     world = np.array(read(folder, OF_TRANSFORMS | {"world_from_camera": True}).spec.photos[1].world_from_camera)
-    assert np.allclose(world @ [0, 0, 1], (-1, 0, 0)) and np.allclose(world @ [0, 1, 0], (0, -1, 0))
+    assert np.allclose(world @ [0, 0, 1], (-1, 0, 0)) and np.allclose(world @ [0, 1, 0], (0, 1, 0))
+
+
+@pytest.mark.parametrize("azimuths", [360.0, 20.0])
+def test_the_world_stands_upright_by_the_horizon_of_photos_that_look_down_and_are_held_askew(azimuths):
+    rng = np.random.default_rng(0)
+    tilted = Rotation.from_rotvec([0.7, -0.3, 1.9]).as_matrix()  # world from one that stands upright
+    rotations = []
+    for angle in np.linspace(0, azimuths, 12, endpoint=False):
+        roll, down = np.radians([2 * rng.normal(), rng.uniform(5, 40)])
+        level = Rotation.from_euler("YXZ", [np.radians(angle), -down, roll]).as_matrix()
+        rotations.append(tilted @ level)
+    upright = tilted @ [0, -1, 0]
+    error = np.degrees(np.arccos(upright_turn(rotations) @ upright @ [0, -1, 0]))
+    assert error < (2 if azimuths == 360 else 15)  # the mean of the photos is 22° off
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_the_axis_that_is_named_points_up(up):
+    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    turn = upright_turn([], up)
+    assert np.allclose(turn @ axis, [0, -1, 0]) and np.linalg.det(turn) == pytest.approx(1)
+    assert np.allclose(turn.T @ turn, np.eye(3))
 
 
 def test_a_field_of_view_is_a_focal_length_at_any_size_and_a_frames_own_lens_goes_before_the_files(folder):

@@ -9,6 +9,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import msgspec
+import numpy as np
+import pycolmap
+from jaxtyping import Float
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal, plain_path
@@ -30,6 +33,8 @@ from factorlib.errors import did_you_mean
 
 SUFFIXES = (*IMAGES, ".webp", ".bmp")  # Other suffixes are part of a name: transforms.json may say "r_0.5".
 READERS = {"colmap": read_colmap, "transforms": read_transforms, "bop": read_bop}
+# Standard deviations of photos that people take, in radians: roll about the view, and height of the view.
+ROLL, TILT = np.radians([3.0, 30.0])
 log = logging.getLogger("factorlib.dataset")
 
 
@@ -72,12 +77,63 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
                 focal, centre = pinhole(image.camera, image.key, refuse)
                 known = focal if image.focal_known else None
                 external[photo.name] = ExternalCamera(kind, known, None if image.centred else centre, image.size, poses)
-            if source.world_from_camera and photo.world_from_camera is None:
-                assert image.cam_from_world is not None  # world_from_camera does not go with bop, which has no world
-                world_from_camera = as_rows(image.cam_from_world.inverse().rotation)
-                photo = msgspec.structs.replace(photo, world_from_camera=world_from_camera)
         photos.append(photo)
+    if source.world_from_camera:
+        photos = fix_to_upright_world(photos, images, source.up)
     return msgspec.structs.replace(spec, photos=photos), external
+
+
+def fix_to_upright_world(
+    photos: list[PhotoEntry], images: Mapping[str, SourceImage], up: str | None
+) -> list[PhotoEntry]:
+    """Return the photos with world_from_camera of the source, in its world turned so that −y points up.
+
+    A photo that has its own stays as it is, and the world is not turned then.
+
+    Args:
+        photos: photos of the dataset
+        images: image of the source by photo
+        up: axis of the source's world that points up; None: that of the cameras' common horizon
+    """
+    rotations = {
+        name: np.array(as_rows(image.cam_from_world.inverse().rotation))
+        for name, image in images.items()
+        if image.posed and image.cam_from_world is not None  # bop, which has no world, does not ask for it
+    }
+    turn = np.eye(3)
+    if not any(photo.world_from_camera for photo in photos):
+        turn = upright_turn(list(rotations.values()), up)
+    return [
+        msgspec.structs.replace(photo, world_from_camera=as_rows(pycolmap.Rotation3d(turn @ rotations[photo.name])))
+        if photo.name in rotations and photo.world_from_camera is None
+        else photo
+        for photo in photos
+    ]
+
+
+def upright_turn(rotations: list[Float[np.ndarray, "3 3"]], up: str | None = None) -> Float[np.ndarray, "3 3"]:
+    """Return the smallest turn of a world after which −y points up, as in a camera that is held level.
+
+    Photos are held level: their horizontal axes a_k are at right angles to the upright u, which the cameras' own
+    upright axes b_k follow loosely.  u minimises Σ (a_k·u)²/ROLL² + Σ |u − b_k|²/TILT².
+
+    Args:
+        rotations: world_from_camera of the photos
+        up: axis of the world that points up; None: u
+    """
+    if up:
+        upright = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    else:
+        across, below = (np.array(rotations)[:, :, k] for k in (0, 1))
+        upright = np.linalg.solve(across.T @ across / ROLL**2 + len(rotations) * np.eye(3) / TILT**2, -below.sum(0))
+        upright /= max(float(np.linalg.norm(upright)), 1e-12)
+    cosine = -upright[1]
+    if cosine < -1 + 1e-9:  # upside down
+        return np.diag([1.0, -1.0, -1.0])
+    # Rodrigues' formula of the turn from u to −y
+    x, y, z = np.cross(upright, [0.0, -1.0, 0.0])
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + cosine)
 
 
 def match_images(
