@@ -11,7 +11,9 @@ Tint   Lights are as near to grey as possible, as the paper's prior asks.  Let E
        The paper sums weights, which are peak values.  One broad lobe and several sharper ones in its place have
        different summed weights, but equal summed energies.
 Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`.  A bright material in a room reflects most of
-       the light, as in most photographs of objects, and Mitsuba requires a value below one.
+       the light, as in most photographs of objects, and Mitsuba requires a value below one.  Interreflection and
+       surroundings determine a scale to about a quarter of itself only.  Where a reflectance exceeds 1 at it, which no
+       surface has, the component takes this scale, too, at its own tint.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ RULE = (
 )
 DETERMINED = (
     "; components in which interreflection or surroundings were seen have no free factor, and reflectances as these "
-    "determine them"
+    "determine them, but none above 1"
 )
 GIVEN = "; in components with known materials or lights, scale and white balance come from these: {}"
 UP_TO_SCALE = "; where lights are known up to a factor, white balance comes from them: {}"
@@ -89,14 +91,15 @@ def fix_gauge(point: Point, blocks: Sequence[Block], known: KnownValues = KnownV
     names = [block.name for block in blocks]
     for members, illuminations in connected_components(blocks, len(point.materials)):
         linked_lights = [names.index(name) for name in illuminations]
-        factors = known.free_factors(members, illuminations) if has_free_factor(blocks, illuminations) else 0
-        if not linked_lights or not factors:
-            continue
         rows = list(members)
+        factors = known.free_factors(members, illuminations)
+        is_free = has_free_factor(blocks, illuminations)
+        if not linked_lights or not factors or not (is_free or (diffuse[rows] + specular[rows]).max() > 1):
+            continue
         # log s_c from the geometric means of E_ic; reflectances take 1/s_c and the scale of BRIGHTEST
         sums = np.array([lights[i].energy.sum(0) for i in linked_lights])
         level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
-        tint = (level.mean(1, keepdims=True) - level).mean(0) if factors == 3 else np.zeros(3)
+        tint = (level.mean(1, keepdims=True) - level).mean(0) if is_free and factors == 3 else np.zeros(3)
         factor = 1 / np.exp(tint)  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
         diffuse[rows] = diffuse[rows] * factor

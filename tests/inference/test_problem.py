@@ -217,6 +217,18 @@ def test_what_interreflection_determines_the_gauge_leaves(illumination):
     ).any()
 
 
+def test_no_reflectance_is_above_one_where_interreflection_determines_the_scale(illumination):
+    """One factor for the whole component, so that tints stay."""
+    light = illumination.light
+    bright = Materials(3 * MATERIALS.diffuse * [1.0, 1.3, 0.8], 3 * MATERIALS.specular, MATERIALS.roughness)
+    settled = fix_gauge(Point(bright, [light]), [illumination.block])
+    assert (settled.materials.diffuse + settled.materials.specular).max() == pytest.approx(BRIGHTEST)
+    factor = settled.materials.vector()[0] / bright.vector()[0]
+    np.testing.assert_allclose(settled.materials.diffuse, factor * bright.diffuse)
+    np.testing.assert_allclose(settled.lights[0].weight, light.weight / factor)
+
+
+
 # ── Lights on cells: what equal ones show, and what splitting keeps ─────────────────────────────────────────────────
 
 
