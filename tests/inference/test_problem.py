@@ -228,7 +228,6 @@ def test_no_reflectance_is_above_one_where_interreflection_determines_the_scale(
     np.testing.assert_allclose(settled.lights[0].weight, light.weight / factor)
 
 
-
 # ── Lights on cells: what equal ones show, and what splitting keeps ─────────────────────────────────────────────────
 
 
