@@ -5,13 +5,12 @@ precedence: an object with a pose or keypoints there gets no pose from the sourc
 """
 
 import logging
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pycolmap
-from jaxtyping import Float
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal, plain_path
@@ -34,7 +33,7 @@ from factorlib.errors import did_you_mean
 SUFFIXES = (*IMAGES, ".webp", ".bmp")  # Other suffixes are part of a name: transforms.json may say "r_0.5".
 READERS = {"colmap": read_colmap, "transforms": read_transforms, "bop": read_bop}
 # Standard deviations of photos that people take, in radians: roll about the view, and height of the view.
-ROLL, TILT = np.radians([3.0, 30.0])
+ROLL, TILT = math.radians(3), math.radians(30)
 log = logging.getLogger("factorlib.dataset")
 
 
@@ -96,22 +95,22 @@ def fix_to_upright_world(
         up: axis of the source's world that points up; None: that of the cameras' common horizon
     """
     rotations = {
-        name: np.array(as_rows(image.cam_from_world.inverse().rotation))
+        name: image.cam_from_world.inverse().rotation
         for name, image in images.items()
         if image.posed and image.cam_from_world is not None  # bop, which has no world, does not ask for it
     }
-    turn = np.eye(3)
+    turn = pycolmap.Rotation3d()
     if not any(photo.world_from_camera for photo in photos):
         turn = upright_turn(list(rotations.values()), up)
     return [
-        msgspec.structs.replace(photo, world_from_camera=as_rows(pycolmap.Rotation3d(turn @ rotations[photo.name])))
+        msgspec.structs.replace(photo, world_from_camera=as_rows(turn * rotations[photo.name]))
         if photo.name in rotations and photo.world_from_camera is None
         else photo
         for photo in photos
     ]
 
 
-def upright_turn(rotations: list[Float[np.ndarray, "3 3"]], up: str | None = None) -> Float[np.ndarray, "3 3"]:
+def upright_turn(rotations: list[pycolmap.Rotation3d], up: str | None = None) -> pycolmap.Rotation3d:
     """Return the smallest turn of a world after which −y points up, as in a camera that is held level.
 
     Photos are held level: their horizontal axes a_k are at right angles to the upright u, which the cameras' own
@@ -122,18 +121,33 @@ def upright_turn(rotations: list[Float[np.ndarray, "3 3"]], up: str | None = Non
         up: axis of the world that points up; None: u
     """
     if up:
-        upright = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+        upright = [(-1.0 if up[0] == "-" else 1.0) * (axis == up[-1]) for axis in "xyz"]
     else:
-        across, below = (np.array(rotations)[:, :, k] for k in (0, 1))
-        upright = np.linalg.solve(across.T @ across / ROLL**2 + len(rotations) * np.eye(3) / TILT**2, -below.sum(0))
-        upright /= max(float(np.linalg.norm(upright)), 1e-12)
-    cosine = -upright[1]
-    if cosine < -1 + 1e-9:  # upside down
-        return np.diag([1.0, -1.0, -1.0])
-    # Rodrigues' formula of the turn from u to −y
-    x, y, z = np.cross(upright, [0.0, -1.0, 0.0])
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + cosine)
+        # (Σ a aᵀ/ROLL² + n/TILT²) u = Σ b/TILT², by Cramer's rule
+        matrix = [[len(rotations) / TILT**2 * (i == k) for i in range(3)] for k in range(3)]
+        right = [0.0] * 3
+        for rotation in rotations:
+            across, below = as_rows(rotation.inverse())[:2]  # rows of the inverse are the camera's axes in the world
+            for i in range(3):
+                right[i] -= below[i] / TILT**2
+                for k in range(3):
+                    matrix[i][k] += across[i] * across[k] / ROLL**2
+        crosses = [cross(matrix[1], matrix[2]), cross(matrix[2], matrix[0]), cross(matrix[0], matrix[1])]
+        upright = [sum(right[k] * crosses[k][i] for k in range(3)) for i in range(3)]  # times the determinant
+    length = max(math.hypot(*upright), 1e-300)
+    axis = cross([value / length for value in upright], [0.0, -1.0, 0.0])
+    sine = math.hypot(*axis)
+    if sine < 1e-9:  # upright or upside down
+        axis, sine = [1.0, 0.0, 0.0], 1.0
+        angle = math.pi * (upright[1] > 0)
+    else:
+        angle = math.atan2(sine, -upright[1] / length)
+    return pycolmap.Rotation3d([angle / sine * value for value in axis])
+
+
+def cross(a: list[float], b: list[float]) -> list[float]:
+    """Return the cross product; without NumPy, which a run with nothing to do does not load."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def match_images(
