@@ -313,14 +313,15 @@ class PartModel(msgspec.Struct, frozen=True):
     def best_fit(self, count: int, fewer: Parts) -> Parts:
         """Return the likeliest fit of three starts.
 
-        They are one part of fewer parts split, and clusters under ambient light, of colour or of chroma alone.
+        They are one part of fewer parts split, and clusters under ambient light, of colour or of chroma alone.  There
+        are fewer clusters where patches have fewer colours.
 
         Args:
-            count: Number of parts.
-            fewer: Fit of one part less.
+            count: Largest number of parts.
+            fewer: Fit of fewer parts.
         """
         residual = self.log_radiance - fewer.log_irradiance
-        splits = [self.mixture(residual, self._split(residual, fewer, k)) for k in range(count - 1)]
+        splits = [self.mixture(residual, self._split(residual, fewer, k)) for k in range(len(fewer.reflectance))]
         starts = [max(splits, key=lambda split: split[1])[0]]
         ambient = self.ambient
         for values in (ambient, ambient[:, :2] - ambient[:, 2:]):

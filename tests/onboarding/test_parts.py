@@ -91,6 +91,11 @@ def test_materials_in_a_sun_are_found_whatever_the_exposures(lit, exposed):
             assert own.sum() < 100 or max(overlaps) > 0.9
 
 
+def test_photos_with_fewer_colours_than_parts_are_no_error(lit):
+    surface = find_parts(lit[0], lambda name: np.full((CAMERA.height, CAMERA.width, 3), 0.2))
+    assert surface.shares.sum() == pytest.approx(1)
+
+
 def test_a_plain_solid_in_a_sun_is_one_part(lit):
     outlines, faces, light = lit
     read = partial(photo, radiance=0.6 * light, faces=faces, exposures=np.ones((len(outlines), 1)))
