@@ -51,7 +51,7 @@ from factorlib.inference.cast_shadows import cast_shadows
 from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule
 from factorlib.inference.fit_runner import FitRunner, SolveState
 from factorlib.inference.materials import Point
-from factorlib.inference.normal_errors import weighed_by_confidence, with_normal_errors
+from factorlib.inference.normal_errors import with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
@@ -379,11 +379,6 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
     the near lights.  The smaller Bayes factor counts.  A light that is less likely at one distance than at infinity is
     not tried nearer.
 
-    Neighbouring normals are wrong together, and a near light explains what that does to thin parts away from the
-    middle.  Observations therefore have the share of their weight that is the confidence of their normals.  On
-    data/eames, whose patio is outdoors, its log Bayes factor is then 3, 1 and −1 for three draws instead of 2, 19 and
-    28; those of both rooms stay above 12.
-
     Args:
         problem: Observations with reliable normals, under the chosen effects.
         before: Fit to the comparison sample.
@@ -395,7 +390,7 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
     evidence = [Decision(light.curvature > 0) for light in before.point.lights]
     if options.distance == "off" or not candidates:
         return Selection(before, evidence)
-    sample = weighed_by_confidence(comparison_sample(problem, before, options))
+    sample = comparison_sample(problem, before, options)
 
     def fit_with_curvatures(
         curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE

@@ -8,7 +8,7 @@ import pytest
 
 from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.images.tone import curve
-from factorlib.inference import normal_errors, suns
+from factorlib.inference import suns
 from factorlib.inference.blocks import Noise
 from factorlib.inference.fit import FitSchedule, reliable_observations
 from factorlib.inference.fit_runner import FitRunner
@@ -334,19 +334,6 @@ def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     assert all(one.accepted == (one.log_bayes_factor > VERY_STRONG) for one in result.distances)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
     assert error_of(result) < 0.5 * error_of(far), (error_of(result), error_of(far))
-
-
-def test_unsure_normals_tell_less_of_a_distance(monkeypatch):
-    """Apart from their own variance: neighbours are wrong together."""
-    monkeypatch.setattr(normal_errors, "DEVIATION", 0.0)
-    blocks = [none_held_out(block) for block in photographed_at(0.2)]
-    fit = begun(JointProblem(blocks, OPERATOR), 60)
-    factors = []
-    for sure in (1.0, 0.2):
-        unsure = [msgspec.structs.replace(block, confidence=np.full(len(block), sure)) for block in blocks]
-        (decision,) = select_distances(JointProblem(unsure, OPERATOR), fit, QUICK, FitRunner()).evidence
-        factors.append(decision.log_bayes_factor)
-    assert factors[0] > 20 and factors[1] < 0.5 * factors[0]
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
