@@ -37,7 +37,7 @@ EXCLUDED = {  # keys that a source of cameras excludes, and why
     "transforms": (("obj_ids", "mesh_unit_mm"), "world_from_object gives its poses"),
     "bop": (("world_from_object", "world_from_camera"), "obj_ids gives its poses"),
     "sfm": (
-        ("images", "world_from_object", "world_from_camera", "obj_ids", "mesh_unit_mm"),
+        ("images", "world_from_object", "world_from_camera", "up", "obj_ids", "mesh_unit_mm"),
         "its world is not known beforehand",
     ),
 }
@@ -463,6 +463,13 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
             f"cannot be combined with {kind}: {reason}",
             "leave it out",
         )
+    own = [index for index, photo in enumerate(spec.photos) if photo.world_from_camera]
+    refuse.refuse_if(
+        source.up is not None and (not source.world_from_camera or bool(own)),
+        "cameras.up",
+        f"turns no world: photos[{own[0]}] has its own world_from_camera" if own else "turns no world",
+        "leave it out" if own else "add world_from_camera: true, which fixes lights to the source's world",
+    )
     if kind == "transforms":
         refuse.check_path("cameras.transforms", source.transforms or "", (".json",))
     elif kind != "sfm":

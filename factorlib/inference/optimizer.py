@@ -161,6 +161,7 @@ class Descent(msgspec.Struct, frozen=True):
         Each step costs one factorisation, also a rejected one.
         """
         damping = 0.0
+        start = state
         for number in range(1, iterations + 1):
             trial = self.linearise(*self._step(state, damping))
             gain = state.value - trial.value
@@ -173,7 +174,7 @@ class Descent(msgspec.Struct, frozen=True):
                 return state, FitStatus("failed", number)
             if gain < 0:
                 damping = max(damping * DAMPING_INCREASE, FIRST_DAMPING)
-        return state, FitStatus("limit", iterations)
+        return state, FitStatus("failed" if state is start and iterations else "limit", iterations)
 
     def linearise(self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"]) -> DescentState:
         """Return the normal equations of all lights at some materials, determinants included."""

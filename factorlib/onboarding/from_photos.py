@@ -123,16 +123,19 @@ def dataset_from_photos(
         views, outlines = refine_masks(
             views, outlines, model, folder, lambda share, text: report(0.9 + share / 20, text)
         )
-        labelled = []
+        proposed = []
         if not (whole or meshes) and len(outlines) >= LEAST_VIEWS:
-            labelled = label_parts(outlines, images, folder, lambda share: report(0.95 + share / 20, "parts by colour"))
+            proposed = label_parts(
+                outlines, {name: images[name] for name in visible}, folder,
+                lambda share: report(0.95 + share / 20, "parts by colour"),
+            )  # fmt: skip
         if unknown := not cameras.source and not meshes:
             cameras = outlined_shape(visible, report)
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
     return missing + [SHAPE] * (unknown and not cameras.revolved), [
         NAMES,
         *cameras.notes,
-        *labelled,
+        *proposed,
         *doubtful_masks(views, outlines),
     ]
 
@@ -399,9 +402,11 @@ def label_parts(
 ) -> list[str]:
     """Write the labels of parts by colour into the masks, and return what to look at, in words.
 
+    Labels of a photo without a camera are unknown, so that parts are proposed only if all photos have one.
+
     Args:
         outlines: outlines by known cameras
-        paths: path of each photo
+        paths: path of each photo with a foreground
         folder: the folder of the masks, as `read_views` writes it
         report: called with the completed share
     """
@@ -412,14 +417,18 @@ def label_parts(
         photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), paths[name])
         return np.where(photo.clipped.any(2, keepdims=True), np.nan, photo.radiance)
 
+    if lost := sorted(set(paths) - {outline.photo for outline in outlines}):
+        return [f"parts by colour are not proposed, because photos have no camera: {', '.join(lost)}"]
+    report(0.0)
     step = -(-len(outlines) // MOST_VIEWS)
     try:
-        surface = find_parts(outlines[::step], read, report)
-    except InputError:  # no hull
-        return []
+        surface = find_parts(outlines[::step], read, lambda share: report(share / 2))
+    except InputError as fault:
+        return [f"parts by colour are not proposed: {fault.fault}"]
     if len(surface.shares) == 1:
         return []
-    for outline in outlines:
+    for k, outline in enumerate(outlines):
+        report((1 + k / len(outlines)) / 2)
         file = folder / "masks" / f"{outline.photo}.png"
         mask = read_inside(file, "PHOTOS")
         labels = surface.label(outline, read(outline.photo))

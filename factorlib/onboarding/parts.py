@@ -8,8 +8,8 @@ then keeps its diffuse radiance in all photos, and the median over photos leaves
 
 with l ≥ 0 the radiance from D directions ω, V their visibility on the hull, and e of one covariance, with heavy tails
 (Student's t).  Given the parts, l is a robust non-negative least-squares fit; given l, parts are a mixture (EM).  Light
-and reflectance may explain the same colours, so that the result depends on which comes first.  Each number of parts
-starts from both, and the highest likelihood counts.
+and reflectance may explain the same colours, so that the result depends on which is estimated first.  Each number of
+parts is fitted from both starts, and the highest likelihood counts.
 
 Number  Schwarz's criterion (BIC) decides among numbers whose parts are all distinct regions.  Two parts are distinct if
         a patch is told apart by its colour with an error of 2 %: if their means are `DISTINCT` standard deviations
@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.cluster.vq import kmeans, vq
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import nnls
@@ -34,8 +34,9 @@ from scipy.special import logsumexp
 
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError
-from factorlib.geometry import open3d as o3d
-from factorlib.geometry.raster import Caster
+from factorlib.geometry.camera import Pose
+from factorlib.geometry.occlusion import Occluders, SurfacePoints
+from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.meshes.mesh import area_vectors
 from factorlib.shapes.hull import visual_hull
@@ -49,6 +50,9 @@ DIRECTIONS = 200  # D of (1)
 LIFT = 0.02  # start of a ray above its patch, as a share of the hull's extent: hulls are bumpy
 LEAST_TRANSPORT = 1e-3  # a patch that sees less of its surroundings is hidden
 LIGHT_DEVIATION = 0.3  # deviation in log radiance beyond which a patch counts less in the fit of the light
+ROUNDS = 4  # fits of the light and of the parts, by turns
+FIRST_ITERATIONS, LATER_ITERATIONS = 6, 2  # of the fit of the light, in the first round and in later ones
+EM_STEPS = 60
 FREEDOM = 4.0  # degrees of freedom of Student's t
 NOISE = 0.01  # standard deviation of log radiance that every covariance contains
 MOST_PARTS = 7
@@ -68,27 +72,28 @@ class Patches:
         hull: The hull.
 
     Attributes:
-        caster: Caster of rays at the hull.
+        surface: Hull, at which rays are cast.
         number: Number of the patch of each face.
-        normal: Normal of each face.
         area: Area of each patch.
         transport: T of (1).
         borders: Length of the border between two patches, in edges.
     """
 
     def __init__(self, hull: Triangles):
-        vectors = area_vectors(hull.vertices, hull.faces)
-        size = np.linalg.norm(vectors, axis=1)
+        size = np.linalg.norm(area_vectors(hull.vertices, hull.faces), axis=1)
         centre = hull.vertices[hull.faces].mean(1)
         extent = float(np.ptp(hull.vertices, axis=0).max())
-        self.caster = Caster(hull.as_mesh())
-        self.normal = vectors / np.maximum(size, 1e-30)[:, None]
-        cells = np.column_stack([np.floor(centre * (PATCHES / extent)), np.rint(self.normal)])
+        self.surface = Occluders([hull.as_mesh()], [Pose(np.eye(3), np.zeros(3))])
+        cells = np.column_stack([np.floor(centre * (PATCHES / extent)), np.rint(self.surface.normal)])
         self.number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
         self.area = np.bincount(self.number, size)
-        place, axis = (self._mean(each, size) for each in (centre, self.normal))
-        axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-30)
-        self.transport = transport_on(hull, place + LIFT * extent * axis, axis)
+        place, axis = (self._mean(each, size) for each in (centre, self.surface.normal))
+        axis = unit(axis)
+        # T of (1) at places just outside the hull
+        points = SurfacePoints(place + LIFT * extent * axis, axis, np.ones(len(place), bool))
+        directions = fibonacci_sphere(DIRECTIONS)
+        visible = self.surface.visibility_from(points, axis, directions).visibility > 0
+        self.transport = 4 / DIRECTIONS * np.maximum(axis @ directions.T, 0) * visible
         self.borders = self._borders(hull.faces)
 
     def _mean(self, values: Float[np.ndarray, "f 3"], weight: Float[np.ndarray, " f"]) -> Float[np.ndarray, "p 3"]:
@@ -113,15 +118,15 @@ class Patches:
             outline: Mask with camera and pose.
             radiance: Linear radiance of its pixels; NaN where it is clipped.
         """
-        hits = self.caster.cast(outline.camera, outline.known_pose)
+        hits = self.surface.cast(outline.camera, outline.known_pose)
         rows, columns = np.nonzero((hits.face >= 0) & (outline.part > 0) & (radiance.min(2) > 0))  # False for NaN
         rays = outline.camera.rays_through(np.column_stack([columns, rows]) + 0.5)
         face = hits.face[rows, columns]
-        facing = np.einsum("ni,ni->n", self.normal[face] @ outline.known_pose.rotation.T, -rays)
-        near = facing > LEAST_COSINE * np.linalg.norm(rays, axis=1)
-        patch = self.number[face[near]]
+        facing = np.einsum("ni,ni->n", self.surface.normal[face] @ outline.known_pose.rotation.T, -rays)
+        frontal = facing > LEAST_COSINE * np.linalg.norm(rays, axis=1)
+        patch = self.number[face[frontal]]
         pixels = np.bincount(patch, minlength=len(self.area))[:, None]
-        logs = np.log(radiance[rows[near], columns[near]])
+        logs = np.log(radiance[rows[frontal], columns[frontal]])
         sums = np.column_stack([np.bincount(patch, column, len(self.area)) for column in logs.T])
         return np.where(pixels >= LEAST_PIXELS, sums / np.maximum(pixels, 1), np.nan)
 
@@ -145,7 +150,7 @@ class Parts(msgspec.Struct, frozen=True):
 
     @property
     def criterion(self) -> float:
-        """Schwarz's criterion: log likelihood less half the number of parameters times the log of that of patches."""
+        """Schwarz's criterion: log likelihood − ½ (number of parameters) log (number of patches)."""
         return self.value - 0.5 * 4 * len(self.reflectance) * float(np.log(len(self.probability)))
 
     @property
@@ -172,8 +177,7 @@ class ColouredSurface(msgspec.Struct, frozen=True):
     @property
     def shares(self) -> Float[np.ndarray, " k"]:
         """Share of the surface of each part."""
-        seen = np.isfinite(self.log_radiance).all(1)
-        area = self.patches.area[seen]
+        area = self.patches.area[is_observed(self.log_radiance)]
         return area @ self.parts.probability / area.sum()
 
     def label(self, outline: Outline, radiance: Float[np.ndarray, "h w 3"]) -> Int[np.ndarray, "h w"]:
@@ -184,9 +188,9 @@ class ColouredSurface(msgspec.Struct, frozen=True):
             radiance: Linear radiance of its pixels; NaN where it is clipped.
         """
         parts = self.parts
-        face = self.patches.caster.cast(outline.camera, outline.known_pose).face
-        seen = np.isfinite(self.log_radiance).all(1)
-        index = np.where(seen, np.cumsum(seen) - 1, -1)
+        face = self.patches.surface.cast(outline.camera, outline.known_pose).face
+        observed = is_observed(self.log_radiance)
+        index = np.where(observed, np.cumsum(observed) - 1, -1)
         patch = np.where(face >= 0, index[self.patches.number[face]], -1)
         known = patch >= 0
         mask = outline.part > 0
@@ -225,36 +229,30 @@ def find_parts(
     patches = Patches(visual_hull(outlines, HULL_CELLS))
     log_radiance = at_one_exposure(np.array([patches.observe(each, read(each.photo)) for each in outlines]))
     log_radiance[patches.transport.sum(1) < LEAST_TRANSPORT] = np.nan
-    if np.isfinite(log_radiance).all(1).sum() <= MOST_PARTS:
+    if is_observed(log_radiance).sum() <= MOST_PARTS:
         raise InputError("no two photos show the same surface", cure="take photos 10 to 20° from each other")
     return ColouredSurface(patches, log_radiance, select_parts(patches, log_radiance, report))
 
 
 def at_one_exposure(observed: Float[np.ndarray, "v p 3"]) -> Float[np.ndarray, "p 3"]:
-    """Return the median over photos of log radiance that two or more observe, less a factor of each photo."""
+    """Return the median log radiance of each patch over photos, which are brought to one exposure and white balance.
+
+    It is NaN where fewer than two photos observe the patch.
+    """
     observed = np.where(np.isfinite(observed).sum(0) > 1, observed, np.nan)
     exposure = np.zeros((len(observed), 3))
-    seen = np.isfinite(observed).any(0).all(1)
+    shared = np.isfinite(observed).any(0).all(1)
     median = np.full(observed.shape[1:], np.nan)
     for _ in range(10):
-        median[seen] = np.nanmedian(observed[:, seen] - exposure[:, None], axis=0)
-        exposure = np.array([np.nanmedian(each[seen] - median[seen], axis=0) for each in observed])
+        median[shared] = np.nanmedian(observed[:, shared] - exposure[:, None], axis=0)
+        exposure = np.array([np.nanmedian(each[shared] - median[shared], axis=0) for each in observed])
         exposure = np.nan_to_num(exposure - np.nanmean(exposure, axis=0))
     return median
 
 
-def transport_on(
-    hull: Triangles, origin: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"]
-) -> Float[np.ndarray, "p d"]:
-    """Return T of (1) at places outside the hull."""
-    direction = fibonacci_sphere(DIRECTIONS)
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(o3d.core.Tensor(hull.vertices.astype("f4")), o3d.core.Tensor(hull.faces.astype("u4")))
-    rays = np.empty((len(origin), DIRECTIONS, 6), np.float32)
-    rays[..., :3] = origin[:, None]
-    rays[..., 3:] = direction
-    visible = ~scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
-    return 4 / DIRECTIONS * np.maximum(normal @ direction.T, 0) * visible
+def is_observed(log_radiance: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
+    """Return a mask of the patches whose radiance is known."""
+    return np.isfinite(log_radiance).all(1)
 
 
 def select_parts(patches: Patches, log_radiance: Float[np.ndarray, "p 3"], report: Report) -> Parts:
@@ -265,10 +263,10 @@ def select_parts(patches: Patches, log_radiance: Float[np.ndarray, "p 3"], repor
         log_radiance: log L; NaN where unknown.
         report: Called with the completed share.
     """
-    seen = np.isfinite(log_radiance).all(1)
-    borders = patches.borders[seen][:, seen]
-    area = patches.area[seen]
-    model = PartModel(log_radiance[seen], patches.transport[seen], area / area.mean())
+    observed = is_observed(log_radiance)
+    borders = patches.borders[observed][:, observed]
+    area = patches.area[observed]
+    model = PartModel(log_radiance[observed], patches.transport[observed], area / area.mean())
     parts = selected = model.fit(np.ones((len(area), 1)))
     for count in range(2, MOST_PARTS + 1):
         report((count - 1) / MOST_PARTS)
@@ -342,15 +340,17 @@ class PartModel(msgspec.Struct, frozen=True):
         pair = parts.probability[:, [k]] * np.column_stack([upper, ~upper])
         return np.hstack([np.delete(parts.probability, k, axis=1), pair])
 
-    def fit(self, probability: Float[np.ndarray, "p k"], rounds: int = 4) -> Parts:
+    def fit(self, probability: Float[np.ndarray, "p k"]) -> Parts:
         """Return the fit of parts and light by turns, from the probabilities of parts."""
         reflectance = np.zeros((probability.shape[1], 3))
         if reflectance.shape[0] > 1:
             weighted = probability * self.weight[:, None]
             reflectance = weighted.T @ self.ambient / np.maximum(weighted.sum(0), 1e-12)[:, None]
         irradiance = self.log_radiance - probability @ reflectance
-        for number in range(rounds):
-            irradiance = self.fit_light(probability @ reflectance, irradiance, 2 if number else 6)
+        for number in range(ROUNDS):
+            irradiance = self.fit_light(
+                probability @ reflectance, irradiance, LATER_ITERATIONS if number else FIRST_ITERATIONS
+            )
             residual = self.log_radiance - irradiance
             probability, value, reflectance, covariance = self.mixture(residual, probability)
         return Parts(reflectance, covariance, probability, irradiance, value)
@@ -392,7 +392,7 @@ class PartModel(msgspec.Struct, frozen=True):
             probability: Initial probabilities of parts.
         """
         trust = np.ones_like(probability)
-        for _ in range(60):
+        for _ in range(EM_STEPS):
             share = probability * self.weight[:, None]
             weighted = share * trust
             means = weighted.T @ residual / np.maximum(weighted.sum(0), 1e-12)[:, None]

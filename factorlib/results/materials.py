@@ -163,8 +163,8 @@ class FitStatus(msgspec.Struct, frozen=True):
     """End of an iterative fit.
 
     Attributes:
-        outcome: converged: the last step lowered the objective by less than its tolerance; limit: the last allowed step
-            lowered it by more; failed: no step lowered it
+        outcome: converged: the last step lowered the objective by less than its tolerance; limit: the allowed steps
+            ended first; failed: no step lowered it
         steps: number of steps
     """
 

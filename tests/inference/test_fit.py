@@ -238,6 +238,16 @@ def test_an_unknown_at_its_bound_stops_no_other(exponents):
     assert early == FitStatus("limit", 1)
 
 
+def test_a_descent_that_no_step_improves_says_that_it_failed(monkeypatch):
+    problem, _ = photographed(5, 1, cells=40, size=10)
+    start = begun(problem, 40)
+    monkeypatch.setattr(
+        Descent, "_step", lambda self, state, damping: (state.likelihoods, state.theta + np.array([5.0] * 6 + [0.0]))
+    )
+    result = fit_problem(problem, start, PRIOR, FitSchedule(descents=(3,)))
+    assert result.status == [FitStatus("failed", 3)]
+
+
 def test_where_a_descent_ends_the_likelihood_has_no_slope_left():
     """Of (1) of the optimizer, in directions that matter: by far less than at the start."""
     problem, _ = photographed(5, 2, cells=40, size=10)

@@ -20,6 +20,7 @@ from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     CLEARLY_FOR,
+    CURVATURES,
     LEAST_TONE_GAIN,
     VERY_STRONG,
     Losses,
@@ -334,6 +335,18 @@ def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     assert all(one.accepted == (one.log_bayes_factor > VERY_STRONG) for one in result.distances)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
     assert error_of(result) < 0.5 * error_of(far), (error_of(result), error_of(far))
+
+
+def test_a_light_that_is_far_is_tried_at_one_distance_alone():
+    class Counting(FitRunner):
+        def fit(self, phase, model, start, schedule):
+            tried.append({light.curvature for light in start.point.lights})
+            return super().fit(phase, model, start, schedule)
+
+    tried = []
+    problem = JointProblem([none_held_out(block) for block in photographed_at(0.0)], OPERATOR)
+    (decision,) = select_distances(problem, begun(problem, 60), QUICK, Counting()).evidence
+    assert decision.log_bayes_factor < 0 and tried == [{0.0}, {CURVATURES[0]}]
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():

@@ -110,6 +110,17 @@ def test_a_mask_of_another_thing_is_found_again_where_the_other_photos_show_the_
     assert not any("differs" in note for note in notes)
 
 
+def test_parts_are_not_proposed_where_a_photo_has_no_camera(cut_outs):
+    """Its pixels would all be the first part's."""
+    file = cut_outs / "capture" / "transforms.json"
+    content = json.loads(file.read_text())
+    lens = {"fl_x": CAMERA.focal, "w": CAMERA.width, "h": CAMERA.height}
+    del content["frames"][-1]["transform_matrix"]
+    file.write_text(json.dumps(content | lens))
+    _, notes = dataset_from_photos(cut_outs / "mine", cut_outs / "capture", None, None, lambda share, text: None)
+    assert "parts by colour are not proposed, because photos have no camera: 7" in notes
+
+
 NFC, NFD = "k\u00fcche", "ku\u0308che"
 RIG = [
     f"{kind}/{side}/7.{suffix}" for kind, suffix in (("images", "jpg"), ("masks", "png")) for side in ("front", "back")

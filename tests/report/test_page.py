@@ -17,9 +17,18 @@ from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
 from factorlib.report.comparison import comparison
 from factorlib.report.pictures import downsample
+from factorlib.report.template import sentences
 from factorlib.results.exchange import Exchange
 from factorlib.results.lobe_table import write_lobes
-from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, attach_errors
+from factorlib.results.materials import (
+    FitStatus,
+    Gauge,
+    MaterialTable,
+    Model,
+    Reflectance,
+    StandardErrors,
+    attach_errors,
+)
 from factorlib.results.photos import PhotoFacts
 from factorlib.results.surface_table import DetailEvidence
 from factorlib.results.texture_table import TextureEvidence, TextureTable
@@ -350,3 +359,11 @@ def test_reducing_keeps_the_mean_and_a_constant(size):
     assert max(small.shape[:2]) == 25 and small.mean() == pytest.approx(picture.mean(), rel=1e-4)
     assert downsample(np.ones((*size, 1), np.float32), 25) == pytest.approx(np.ones((*small.shape[:2], 1)), rel=1e-5)
     assert downsample(picture, 200) is picture
+
+
+def test_fits_that_did_not_converge_are_named():
+    ends = {"room": FitStatus("converged", 2), "yard": FitStatus("limit", 2)}
+    lines = sentences("choices.txt", model=Model(materials_fit=FitStatus("failed", 4), light_fits=ends))
+    assert "The fit of the materials did not converge: no step lowered its objective." in lines
+    assert "The fit of the light yard did not converge: its 2 allowed steps ended first." in lines
+    assert not any("room" in line for line in lines)
