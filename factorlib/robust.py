@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+TINY = 1e-300  # keeps a denominator or the argument of a logarithm above 0
 PER_MEDIAN = 1.4826  # σ over the median of |x| for a normal x of mean 0
 
 

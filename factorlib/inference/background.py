@@ -27,6 +27,7 @@ from scipy.linalg import cho_solve, cholesky
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.inference.lights import Light
 from factorlib.light.lobes import lobe_energy
+from factorlib.robust import TINY
 
 DEVIATION = 0.4  # standard deviation of the log radiance of a cell that is observed whole
 # Standard deviations of the factor that all cells of a light share: of the mean over channels of its logarithm, and of
@@ -77,7 +78,7 @@ class Background(msgspec.Struct, frozen=True):
         sharpness = np.minimum(light.sharpness, SHARPEST)
         kernel = np.exp(sharpness[:, None] * (light.axis @ self.direction.T - 1)) * self.solid_angle
         weight = kernel.sum(1)
-        mean = kernel @ self.radiance / np.maximum(weight, 1e-300)[:, None]
+        mean = kernel @ self.radiance / np.maximum(weight, TINY)[:, None]
         coverage = np.where(light.suns, 0.0, np.minimum(weight / lobe_energy(sharpness), 1))
         return coverage, np.log(np.maximum(mean, LEAST_RADIANCE))
 

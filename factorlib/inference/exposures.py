@@ -26,6 +26,7 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.known import KnownValues
 from factorlib.inference.likelihood import EXPOSURE_DEVIATION, LightLikelihood
+from factorlib.inference.materials import REFLECTANCES, UNKNOWNS
 from factorlib.inference.optimizer import Descent, DescentState
 
 
@@ -56,7 +57,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
         log_factors = np.zeros(len(theta))
         log_factors[moving] = logs
         moved = theta.copy()
-        moved[:, :6] += log_factors[group][:, None]
+        moved[:, :REFLECTANCES] += log_factors[group][:, None]
         return moved, log_factors
 
     def energy(logs: Float[np.ndarray, " g"]) -> tuple[float, Float[np.ndarray, " g"]]:
@@ -64,7 +65,7 @@ def balance_exposures(state: DescentState, descent: Descent, known: KnownValues)
         moved, log_factors = move(logs)
         on_materials = descent.prior.evaluate(moved)
         value = on_materials.value
-        slope = np.bincount(group, 2 * on_materials.gradient.reshape(-1, 7)[:, :6].sum(1), len(theta))
+        slope = np.bincount(group, 2 * on_materials.gradient.reshape(-1, UNKNOWNS)[:, :REFLECTANCES].sum(1), len(theta))
         for term in terms:
             of_light, slope_of_light = term.energy(log_factors)
             value = value + of_light

@@ -29,7 +29,7 @@ from torch import Tensor
 from factorlib.images.tone import by_log_exponent
 from factorlib.inference.blocks import Block, RobustLoss
 from factorlib.inference.lights import Light, UnitLobes
-from factorlib.inference.materials import Materials
+from factorlib.inference.materials import REFLECTANCES, UNKNOWNS, Materials
 from factorlib.inference.responses import (
     CHUNK,
     ResponseLookup,
@@ -266,7 +266,7 @@ class Illumination(msgspec.Struct, frozen=True):
         by_linear = by_radiance * light.tone_slope(prediction.radiance, block.photo)
         from_light = prediction.linear - self.bounced
         # Σ a ∂ℓ/∂(log k_d, log k_s, roughness), and Dᵀ a e k_d + Sᵀ a e k_s with respect to w
-        by_materials = np.zeros((len(self.materials), 7))
+        by_materials = np.zeros((len(self.materials), UNKNOWNS))
         by_weight = np.zeros((len(light), 3))
         detail = self.detail
         for m, rows, lookup in prediction.responses:
@@ -336,7 +336,7 @@ class Illumination(msgspec.Struct, frozen=True):
                 yield Linearised(
                     c,
                     rows,
-                    7 * m + np.array([c, 3 + c, 6]),
+                    UNKNOWNS * m + np.array([c, 3 + c, REFLECTANCES]),
                     diffuse[:, free],
                     specular[:, free],
                     by_roughness[:, free],

@@ -29,6 +29,7 @@ from scipy.sparse.csgraph import connected_components as components_of_graph
 from factorlib.inference.blocks import Block
 from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Materials, Point
+from factorlib.robust import TINY
 
 BRIGHTEST = 0.9
 # Least energy, as a share of a light's brightest channel: a light without blue does not decide how blue the others are.
@@ -98,7 +99,7 @@ def fix_gauge(point: Point, blocks: Sequence[Block], known: KnownValues = KnownV
             continue
         # log s_c from the geometric means of E_ic; reflectances take 1/s_c and the scale of BRIGHTEST
         sums = np.array([lights[i].energy.sum(0) for i in linked_lights])
-        level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
+        level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), TINY)))
         tint = (level.mean(1, keepdims=True) - level).mean(0) if is_free and factors == 3 else np.zeros(3)
         factor = 1 / np.exp(tint)  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()

@@ -17,9 +17,10 @@ from factorlib.inference.answer import Answer
 from factorlib.inference.blocks import Block
 from factorlib.inference.exposures import material_groups
 from factorlib.inference.gauge import LEAST_ENERGY, connected_components, has_free_factor
-from factorlib.inference.materials import ROUGHNESS, Materials, Point
+from factorlib.inference.materials import REFLECTANCES, ROUGHNESS, Materials, Point
 from factorlib.inference.observed import PhotoObservations
 from factorlib.inference.problem import JointProblem
+from factorlib.robust import TINY
 
 FEW_OBSERVATIONS = 40  # observations: a few for each of 7 unknowns of a material and for the light that it mirrors
 LEAST_SPREAD_DEG = 15.0  # mirror directions within this angle of their mean show one patch of the light
@@ -131,7 +132,7 @@ def _spread(block: Block) -> float:
     """Return the largest angle between a mirror direction and their mean, degrees."""
     mirror = mirror_directions(block.normal, block.view)
     mean = mirror.mean(0)
-    return float(np.degrees(np.arccos(np.clip(mirror @ mean / max(np.linalg.norm(mean), 1e-12), -1, 1)).max()))
+    return float(np.degrees(np.arccos(np.clip(mirror @ mean / max(np.linalg.norm(mean), TINY), -1, 1)).max()))
 
 
 def after_solving(answer: Answer) -> list[str]:
@@ -164,9 +165,10 @@ def undetermined_by_answer(
 
 def _error_warnings(name: str, estimate: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
     """Yield sentences about one material from its estimate and standard errors, both (k_d, k_s, roughness)."""
-    reflectance = (estimate[:3] + estimate[3:6]).max()
-    largest = error[:6].max()
-    specular = estimate[3:6]
+    reflectance = (estimate[:3] + estimate[3:REFLECTANCES]).max()
+    *errors, roughness_error = error.tolist()
+    largest = max(errors)
+    specular = estimate[3:REFLECTANCES]
     if reflectance < largest <= DARK_BOUND:
         yield (
             f"material '{name}' is so dark that of its reflectance only a bound, about "
@@ -178,15 +180,15 @@ def _error_warnings(name: str, estimate: Float[np.ndarray, "7"], error: Float[np
             "specular part look alike here. A photo in light with a small bright source, or next to a brighter "
             "material, would help"
         )
-    if not (specular.any() or error[3:6].any()):  # k_s is known to be 0: roughness has no meaning
+    if not (specular.any() or error[3:REFLECTANCES].any()):  # k_s is known to be 0: roughness has no meaning
         return
-    if not (error[6] <= ROUGHNESS_ERROR and (specular > 2 * error[3:6]).any()):
+    if not (roughness_error <= ROUGHNESS_ERROR and (specular > 2 * error[3:REFLECTANCES]).any()):
         yield (
-            f"the roughness of material '{name}' cannot be determined (±{error[6]:.2g}): no highlight stands out, or "
-            "shape and photos disagree too much. A photo in light with a small bright source, or a better mesh, "
+            f"the roughness of material '{name}' cannot be determined (±{roughness_error:.2g}): no highlight stands out, "
+            "or shape and photos disagree too much. A photo in light with a small bright source, or a better mesh, "
             "would help"
         )
-    elif estimate[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
+    elif estimate[REFLECTANCES] <= ROUGHNESS[0] + 1e-9 and roughness_error > 0:
         yield (
             f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
         )

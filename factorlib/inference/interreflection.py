@@ -25,6 +25,7 @@ from jaxtyping import Float
 from factorlib.geometry.sphere import BINS, NO_OCCLUDER, fibonacci_sphere
 from factorlib.light.visibility import cosine_weights, widest_sharpness
 from factorlib.reflection.brdf import specular
+from factorlib.robust import TINY
 from factorlib.urm.observations import Observations
 
 HIGHLIGHT_ROUGHNESS = (
@@ -86,7 +87,7 @@ def _mean_by_bin(
     total = np.bincount(bin_number, weight, bins)
     mean = (
         np.column_stack([np.bincount(bin_number, weight * r, bins) for r in radiance.T])
-        / np.maximum(total, 1e-300)[:, None]
+        / np.maximum(total, TINY)[:, None]
     )
     # mean of the bin, shrunk toward the expected one
     count = np.bincount(bin_number, minlength=bins)[:, None]

@@ -30,7 +30,7 @@ from factorlib.dataset.schema import KnownSlice, LightSlice
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
 from factorlib.inference.lights import Light, fibonacci_cells
-from factorlib.inference.materials import ROUGHNESS, Materials
+from factorlib.inference.materials import ROUGHNESS, UNKNOWNS, Materials
 from factorlib.light.lobes import lobe_energy, squared_distances
 from factorlib.urm.observations import Observations
 
@@ -83,7 +83,7 @@ class KnownValues(msgspec.Struct, frozen=True):
 
     def free(self, count: int) -> Bool[np.ndarray, " 7m"]:
         """Return a mask of the unknowns of `count` materials that are to be estimated."""
-        free = np.ones((count, 7), bool)
+        free = np.ones((count, UNKNOWNS), bool)
         for m, values in self.materials.items():
             free[m] = np.isnan(values)
         return free.reshape(-1)

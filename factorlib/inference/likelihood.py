@@ -52,7 +52,7 @@ from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.cast_shadows import CastShadows
 from factorlib.inference.forward import Gradient, Illumination, Linearised
 from factorlib.inference.lights import DARKEST, Light
-from factorlib.inference.materials import Materials
+from factorlib.inference.materials import UNKNOWNS, Materials
 from factorlib.light.prior import LightPrior
 
 HESSIAN_STRIDE = 8  # one row in so many enters the Hessian of the determinant
@@ -175,7 +175,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         illumination = self.illumination
         prediction = illumination.predict()
         p = int(illumination.light.free.sum())
-        places = (7 * np.unique(illumination.block.material)[:, None] + np.arange(7)).reshape(-1)
+        places = (UNKNOWNS * np.unique(illumination.block.material)[:, None] + np.arange(UNKNOWNS)).reshape(-1)
         k = len(places)
         size = illumination.light.unknowns
         value, g_l = self._prior()

@@ -26,9 +26,9 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
 from factorlib.inference.material_prior import Mixture, classes_of
-from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
+from factorlib.inference.materials import LEAST_REFLECTANCE, REFLECTANCES, ROUGHNESS, UNKNOWNS
 
-BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * 6 + [ROUGHNESS]
+BOUNDS = [(float(np.log(LEAST_REFLECTANCE)), 0.0)] * REFLECTANCES + [ROUGHNESS]
 # Largest standard deviation of an unknown in S and A⁻¹: that of the logarithm of a reflectance near 0 is without limit.
 LARGEST_DEVIATION = 2.0
 LEAST_DEVIATION = 1e-6  # least standard deviation in them, so that S has an inverse
@@ -68,7 +68,7 @@ def material_posterior(
     """
     deviation = np.where(free, np.sqrt(np.diag(covariance + model_covariance)), 0.0)
     if not free[3:].any():
-        return MaterialPosterior(fitted, deviation, np.zeros(7))
+        return MaterialPosterior(fitted, deviation, np.zeros(UNKNOWNS))
     mixture = Mixture(classes_of(name), one_tint=False)
     # θ₀ and (A⁻¹ + M)⁻¹ of (1)
     spread = limit_deviations(fit_covariance)
@@ -93,15 +93,15 @@ def material_posterior(
     # ((S + M)⁻¹ + P)⁻¹
     limited = limit_deviations(covariance) + model_covariance
     rows = np.ix_(free, free)
-    variance = np.zeros(7)
+    variance = np.zeros(UNKNOWNS)
     variance[free] = np.diag(np.linalg.inv(np.linalg.inv(limited[rows]) + mixture.evaluate(result)[2][rows]))
     share = np.where(free, 1 - variance / np.diag(limited), 0.0).clip(0, 1)
     # no prior bears on k_d, whose deviation is therefore not limited
-    posterior_deviation = np.where(np.arange(7) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))
+    posterior_deviation = np.where(np.arange(UNKNOWNS) < 3, deviation * np.sqrt(1 - share), np.sqrt(variance))
     return MaterialPosterior(result, posterior_deviation, share)
 
 
 def limit_deviations(covariance: Float[np.ndarray, "7 7"]) -> Float[np.ndarray, "7 7"]:
     """Return a covariance with deviations between `LEAST_DEVIATION` and `LARGEST_DEVIATION`."""
     scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(np.sqrt(np.diag(covariance)), LEAST_DEVIATION))
-    return covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(7)
+    return covariance * np.outer(scale, scale) + LEAST_DEVIATION**2 * np.eye(UNKNOWNS)

@@ -47,7 +47,7 @@ from scipy.linalg import block_diag
 from factorlib.inference.blocks import Block
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.known import KnownValues
-from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, Materials
+from factorlib.inference.materials import LEAST_REFLECTANCE, REFLECTANCES, ROUGHNESS, UNKNOWNS, Materials
 from factorlib.jsonfile import read_json
 from factorlib.reading import reading
 
@@ -173,11 +173,11 @@ class Mixture:
         value = float(least - 2 * np.log(odds.sum()))
         # means over the classes
         difference = probability @ self.difference
-        gradient, hessian = np.zeros(7), np.zeros((7, 7))
+        gradient, hessian = np.zeros(UNKNOWNS), np.zeros((UNKNOWNS, UNKNOWNS))
         gradient[3:] = probability @ slope
-        gradient[:6] += difference * (J.T @ e)
+        gradient[:REFLECTANCES] += difference * (J.T @ e)
         hessian[3:, 3:] = np.einsum("c,cij->ij", probability, self.precision)
-        hessian[:6, :6] += difference * (J.T @ J)
+        hessian[:REFLECTANCES, :REFLECTANCES] += difference * (J.T @ J)
         return value, gradient, hessian, probability
 
 
@@ -230,7 +230,7 @@ class MaterialPrior:
         gradient = gradient.reshape(-1)
         hessian = block_diag(*hessians)
         # (2) of each component's brightest material
-        reflectance = np.exp(theta[:, :6])
+        reflectance = np.exp(theta[:, :REFLECTANCES])
         for members in self.members:
             brightest = members[int(reflectance[members].sum(1).argmax())]
             total = reflectance[brightest].sum()

@@ -12,6 +12,8 @@ ROUGHNESS = (0.1, 1.0)  # range of roughness, the domain of the operators
 # Range of λ of the paper's lobes: from nearly constant to 1.3° wide, about a texel of the exported map.
 SHARPNESS = (0.1, 2000.0)
 LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
+REFLECTANCES = 6  # unknowns that are reflectances: k_d and k_s, RGB each
+UNKNOWNS = REFLECTANCES + 1  # of a material: k_d, k_s, roughness
 
 
 class Materials(msgspec.Struct, frozen=True):
@@ -36,19 +38,19 @@ class Materials(msgspec.Struct, frozen=True):
 
     def rows(self) -> Float[np.ndarray, "m 7"]:
         """Return a copy of the unknowns, one material a row."""
-        return self.vector().reshape(-1, 7)
+        return self.vector().reshape(-1, UNKNOWNS)
 
     @staticmethod
     def from_rows(rows: Float[np.ndarray, "m 7"]) -> Materials:
         """Return the materials with these rows of unknowns."""
-        return Materials(rows[:, :3], rows[:, 3:6], rows[:, 6])
+        return Materials(rows[:, :3], rows[:, 3:REFLECTANCES], rows[:, REFLECTANCES])
 
     @staticmethod
     def from_vector(vector: Float[np.ndarray, " 7m"]) -> Materials:
         """Return the nearest materials within bounds."""
-        rows = vector.reshape(-1, 7)
-        reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)
-        return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, 6], *ROUGHNESS))
+        rows = vector.reshape(-1, UNKNOWNS)
+        reflectance = np.maximum(rows[:, :REFLECTANCES], LEAST_REFLECTANCE)
+        return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, REFLECTANCES], *ROUGHNESS))
 
 
 class MaterialErrors(msgspec.Struct, frozen=True):
@@ -62,7 +64,7 @@ class MaterialErrors(msgspec.Struct, frozen=True):
 
     materials: Materials = Materials(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     deviation: float = 0.0
-    prior_share: Float[np.ndarray, "m 7"] = np.zeros((0, 7))
+    prior_share: Float[np.ndarray, "m 7"] = np.zeros((0, UNKNOWNS))
 
 
 class Point(msgspec.Struct, frozen=True):

@@ -55,6 +55,7 @@ from factorlib.inference.normal_errors import with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
+from factorlib.robust import TINY
 
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
 ONE_CLUSTER = 1.0  # variance of log a_i − log b_i in a light with one cluster, from which none can be estimated
@@ -129,7 +130,7 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
     for a, b, cluster in zip(simpler.values, richer.values, richer.clusters, strict=True):
         # A_k and B_k, then log a_i − log b_i and its variance over clusters
         sums_pair = [np.bincount(cluster, losses + LEAST_LOSS) for losses in (a, b)]
-        shares = [sums / max(float(sums.sum()), 1e-300) for sums in sums_pair]
+        shares = [sums / max(float(sums.sum()), TINY) for sums in sums_pair]
         logs.append([np.log(np.mean(losses) + LEAST_LOSS) if len(losses) else 0.0 for losses in (a, b)])
         number = len(sums_pair[0])
         spread = float(np.sum((shares[0] - shares[1]) ** 2))
@@ -139,9 +140,9 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
     # d of (1), its standard error and degrees of freedom, and the margin
     d = float(share @ [log_pair[0] - log_pair[1] for log_pair in logs])
     parts = share**2 * np.array(variances)
-    degrees = parts.sum() ** 2 / max(float(parts**2 @ (1 / np.array(freedom))), 1e-300)
+    degrees = parts.sum() ** 2 / max(float(parts**2 @ (1 / np.array(freedom))), TINY)
     t = d / max(float(np.sqrt(parts.sum())), 1e-12)
-    margin = float(np.copysign(ndtri(max(stdtr(max(degrees, 1.0), -abs(t)), 1e-300)), t))
+    margin = float(np.copysign(ndtri(max(stdtr(max(degrees, 1.0), -abs(t)), TINY)), t))
     loss_with, loss_without = (float(np.exp(share @ [log_pair[k] for log_pair in logs])) for k in (1, 0))
     return Decision(margin > least, loss_with, loss_without, margin)
 

@@ -32,16 +32,17 @@ from scipy.linalg import cho_factor, cho_solve
 from factorlib.inference.lights import TONE_RANGE, Light
 from factorlib.inference.likelihood import LightLikelihood, System, solve_cholesky
 from factorlib.inference.material_prior import MaterialPrior, PriorTerms, materials_from_unknowns
-from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
+from factorlib.inference.materials import LEAST_REFLECTANCE, REFLECTANCES, ROUGHNESS, UNKNOWNS
 from factorlib.inference.problem import Spread
 from factorlib.results.materials import FitStatus
+from factorlib.robust import TINY
 
 FLOOR = 1e-9  # share of the largest diagonal entry that is added to every diagonal entry
-LARGEST_CHANGE = np.array([0.7] * 6 + [0.1])  # largest change of a material's unknowns on one factorisation
+LARGEST_CHANGE = np.array([0.7] * REFLECTANCES + [0.1])  # largest change of a material's unknowns on one factorisation
 LARGEST_STEP = 1.5  # largest change of an unknown in one cheap step
 LEAST_SLOPE_SHARE = 0.1  # least share of the slope that a clipped direction must keep
-LOWER_BOUNDS = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
-UPPER_BOUNDS = np.array([np.inf] * 6 + [ROUGHNESS[1]])
+LOWER_BOUNDS = np.array([np.log(LEAST_REFLECTANCE)] * REFLECTANCES + [ROUGHNESS[0]])
+UPPER_BOUNDS = np.array([np.inf] * REFLECTANCES + [ROUGHNESS[1]])
 FIRST_DAMPING = 0.1  # μ after the first rejected step
 DAMPING_DECREASE = 0.25  # factor on μ after an accepted step
 DAMPING_INCREASE = 8.0  # factor on μ after a rejected step
@@ -209,7 +210,7 @@ class Descent(msgspec.Struct, frozen=True):
         def apply_step(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
             """Return θ and the lights after a step of all unknowns."""
             material_step, *light_steps = np.split(step, ends)
-            theta = (state.theta + material_step.reshape(-1, 7)).clip(LOWER_BOUNDS, UPPER_BOUNDS)
+            theta = (state.theta + material_step.reshape(-1, UNKNOWNS)).clip(LOWER_BOUNDS, UPPER_BOUNDS)
             materials = materials_from_unknowns(theta)
             steps = zip(state.likelihoods, light_steps, strict=True)
             return theta, [old.with_point(step_light(old.light, step), materials) for old, step in steps]
@@ -237,7 +238,7 @@ class Descent(msgspec.Struct, frozen=True):
 
 def material_limits(theta: Float[np.ndarray, "m 7"], free: Bool[np.ndarray, " k"]) -> Float[np.ndarray, "2 k"]:
     """Return lower and upper limits of a step of the material unknowns; those that are not `free` do not move."""
-    change = free.reshape(-1, 7) * LARGEST_CHANGE
+    change = free.reshape(-1, UNKNOWNS) * LARGEST_CHANGE
     limits = np.maximum(-change, LOWER_BOUNDS - theta), np.minimum(change, UPPER_BOUNDS - theta)
     return np.reshape(limits, (2, theta.size))
 
@@ -288,7 +289,7 @@ def gauge_projection(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
 
     J and the determinant do not change if all reflectances are multiplied by a factor and the light is divided by it.
     """
-    unknown = places[:, None] % 7
+    unknown = places[:, None] % UNKNOWNS
     factors = (unknown == np.arange(3)) | (unknown == np.arange(3, 6))
     return np.eye(len(places)) - factors / factors.sum(0) @ factors.T
 
@@ -327,7 +328,7 @@ def minimise_lbfgs(
             if trial_value <= value + 2 * SUFFICIENT * min(float(gradient @ (trial - x)), 0.0):
                 break
             # minimum of the parabola through both values and the slope
-            length *= float(np.clip(-slope * length / max(trial_value - value - 2 * slope * length, 1e-300), 0.1, 0.5))
+            length *= float(np.clip(-slope * length / max(trial_value - value - 2 * slope * length, TINY), 0.1, 0.5))
         else:
             break
         if (change := trial_gradient - gradient) @ (trial - x) > 0:

@@ -45,7 +45,7 @@ from factorlib.inference.fit import initial_fit
 from factorlib.inference.fit_runner import Event, EventReport, Solution, ignore_event
 from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.lights import Light
-from factorlib.inference.materials import ROUGHNESS, SHARPNESS, Materials, Point
+from factorlib.inference.materials import ROUGHNESS, SHARPNESS, UNKNOWNS, Materials, Point
 from factorlib.inference.optimizer import inverse_hessian_times
 from factorlib.inference.options import Lobes, Seed, SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -59,6 +59,7 @@ Pairs = deque[tuple[Tensor, Tensor]]  # steps, and changes of gradient along the
 MEMORY = 20  # pairs of L-BFGS
 LARGEST_STEP = 0.05  # largest change of an unknown in one step
 SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope
+LOBE_UNKNOWNS = 3 + 1 + 3  # of a lobe: axis, sharpness, weight
 HALVINGS = 12  # most halvings of a step
 LOG_SHARPNESS = (math.log(SHARPNESS[0]), math.log(SHARPNESS[1]))
 REPORTS = 20  # reports in a run
@@ -180,7 +181,9 @@ class PaperObjective:
         self.operator = problem.operator
         self.options = options
         self.start_materials = starting_materials(problem.blocks, materials)
-        self.sizes = [7 * materials] + [7 * options.lobes + len(block.photos) - 1 for block in problem.blocks]
+        self.sizes = [UNKNOWNS * materials] + [
+            LOBE_UNKNOWNS * options.lobes + len(block.photos) - 1 for block in problem.blocks
+        ]
 
     def start(self) -> Float[Tensor, " k"]:
         """Return even lobes under which materials reflect the block's mean radiance, 1."""
@@ -201,13 +204,13 @@ class PaperObjective:
     def unpack(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
         """Return (diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
         material_part, *light_parts = torch.split(x, self.sizes)
-        bounded = torch.sigmoid(material_part.reshape(-1, 7))
+        bounded = torch.sigmoid(material_part.reshape(-1, UNKNOWNS))
         (low, high) = ROUGHNESS
         (least, most) = LOG_SHARPNESS
         lights: list[tuple[Tensor, ...]] = []
         for part in light_parts:
-            rows = part[: 7 * self.options.lobes].reshape(-1, 7)
-            log_exposures = part[7 * self.options.lobes :]
+            rows = part[: LOBE_UNKNOWNS * self.options.lobes].reshape(-1, LOBE_UNKNOWNS)
+            log_exposures = part[LOBE_UNKNOWNS * self.options.lobes :]
             axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
             log_sharpness = least + (most - least) * torch.sigmoid(rows[:, 3])
             weight = torch.nn.functional.softplus(rows[:, 4:])

@@ -32,7 +32,7 @@ from factorlib.inference.blocks import COMPARISON_LOSS, Block
 from factorlib.inference.fit import Fit, Hyperparameters, initial_fit
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.lights import TONE_RANGE, Light, UnitLobes, fibonacci_cells
+from factorlib.inference.lights import DARKEST, TONE_RANGE, Light, UnitLobes, fibonacci_cells
 from factorlib.inference.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -272,7 +272,7 @@ def refine_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
             cells = rotated_cells(block.name, count)
             radiance = light.lobes.radiance(cells.axis)
             lobes = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
-            light = msgspec.structs.replace(light, **lobes).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
+            light = msgspec.structs.replace(light, **lobes).with_log_radiance(np.log(np.maximum(radiance, DARKEST)).T)
         lights.append(light)
     return fit.with_lights(lights)
 

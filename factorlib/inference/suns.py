@@ -38,6 +38,7 @@ from factorlib.inference.model_selection import CLEARLY_AGAINST, WEAKLY_FOR, Los
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import SUN
 from factorlib.results.materials import Decision, FitStatus
+from factorlib.robust import TINY
 
 # Radii about the brightest direction: of the cells that a sun replaces, and of those whose radiance they take.
 DISC_RADIUS, RING_RADIUS = np.radians([14, 28])
@@ -134,7 +135,7 @@ def replace_brightest(illumination: Illumination, sharpness: float) -> Light:
         A = dimmed.unit_responses(np.arange(len(illumination.block)), grid) * trust.T[:, :, None]  # [3, n, q]
         along = np.einsum("cnq,nc->cq", A, trust * residual)
         size = np.einsum("cnq,cnq->cq", A, A)
-        weight = np.maximum(-along, 0) / np.maximum(size, 1e-30)
+        weight = np.maximum(-along, 0) / np.maximum(size, TINY)
         best = int(np.argmax((weight**2 * size).sum(0)))  # decrease of (1)
         z = axes[best]
         w = weight[:, best]

@@ -69,6 +69,7 @@ from factorlib.inference.surface_turns import (
 )
 from factorlib.light.prior import LightPrior
 from factorlib.results.materials import Decision
+from factorlib.robust import TINY
 
 # Stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it.
 TURN_STIFFNESSES = (1000.0, 300.0, 100.0, 30.0, 10.0)
@@ -120,7 +121,7 @@ class PhotoScores(msgspec.Struct, frozen=True):
     def gain_over(self, reference: PhotoScores) -> float:
         """Return the mean decrease of the values, in standard errors over photos."""
         gains = reference.values - self.values
-        return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
+        return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), TINY))
 
 
 def decide_turns(scores: PhotoScores, reference: PhotoScores) -> Decision:

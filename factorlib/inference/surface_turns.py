@@ -39,6 +39,7 @@ from factorlib.light.prior import LightPrior
 from factorlib.meshes.mesh import scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, solve_by_gradients
 from factorlib.results.poses import ObjectPose
+from factorlib.robust import TINY
 
 LARGEST_TURN = 0.6  # largest |n' − n|: 35°
 LEAST_VIEW_COSINE = 0.05  # least n'·o: a normal that would turn further stays as it is
@@ -95,7 +96,7 @@ class SurfacePositions(msgspec.Struct, frozen=True):
         turned = np.einsum("nij,nkj,nk->ni", self.frame, turn[self.node], self.share)
         turned -= normal * np.sum(turned * normal, 1, keepdims=True)
         length = np.linalg.norm(turned, axis=1, keepdims=True)
-        turned = normal + turned * np.minimum(1, LARGEST_TURN / np.maximum(length, 1e-12))
+        turned = normal + turned * np.minimum(1, LARGEST_TURN / np.maximum(length, TINY))
         turned /= np.linalg.norm(turned, axis=1, keepdims=True)
         return np.where(np.sum(turned * view, 1, keepdims=True) < LEAST_VIEW_COSINE, normal, turned)
 

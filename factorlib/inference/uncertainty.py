@@ -64,7 +64,15 @@ from factorlib.inference.likelihood import (
 )
 from factorlib.inference.material_posterior import material_posterior
 from factorlib.inference.material_prior import material_unknowns, materials_from_unknowns
-from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, MaterialErrors, Materials, Point
+from factorlib.inference.materials import (
+    LEAST_REFLECTANCE,
+    REFLECTANCES,
+    ROUGHNESS,
+    UNKNOWNS,
+    MaterialErrors,
+    Materials,
+    Point,
+)
 from factorlib.inference.normal_errors import normal_deviation
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -78,7 +86,7 @@ ABSOLUTE = (
     "; where surfaces light each other or photos show the surroundings, that sum is known too, but to about a "
     "quarter of itself only"
 )
-WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
+WIDTHS = (*[1.0] * REFLECTANCES, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
 # Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
 # roughness.  With them and turns of normals about 68 % of true values lie within one standard error on the sets that
 # settings were chosen on (`studies.measured.standard_errors`).
@@ -172,10 +180,10 @@ class Posterior:
         """Return the standard error of every material unknown by the observations alone."""
         _, by_data, by_normals = self.covariances()
         deviation = residual_deviation(self.problem, self.fit.point)
-        free = self.problem.known.free(len(self.materials)).reshape(-1, 7)
+        free = self.problem.known.free(len(self.materials)).reshape(-1, UNKNOWNS)
         model_errors = free * deviation * MODEL_ERROR * by_unknowns(self.materials)
         # an error is at most the width of its unknown's range
-        errors = np.minimum(np.hypot(np.sqrt(np.diag(by_data + by_normals).reshape(-1, 7)), model_errors), WIDTHS)
+        errors = np.minimum(np.hypot(np.sqrt(np.diag(by_data + by_normals)).reshape(free.shape), model_errors), WIDTHS)
         return MaterialErrors(Materials.from_rows(errors), deviation, np.zeros_like(errors))
 
     def with_prior(self) -> tuple[Materials, MaterialErrors]:
@@ -184,14 +192,14 @@ class Posterior:
         deviation = residual_deviation(self.problem, self.fit.point)
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
-        free = self.problem.known.free(len(unknowns)).reshape(-1, 7)
+        free = self.problem.known.free(len(unknowns)).reshape(-1, UNKNOWNS)
         # normals, and the part of MODEL_ERROR beyond 1 σ, let the prior move the estimate; its part up to 1 σ only
         # widens the error
         noise = min(deviation, 1.0)
         excess = np.sqrt(deviation**2 - noise**2)
         posteriors = []
         for m, theta in enumerate(unknowns):
-            rows = slice(7 * m, 7 * m + 7)
+            rows = slice(UNKNOWNS * m, UNKNOWNS * (m + 1))
             fitted, data, normals = (each[rows, rows] / np.outer(values[m], values[m]) for each in covariances)
             name = self.problem.known.classes.get(m)
             model = normals + np.diag((excess * MODEL_ERROR) ** 2)
