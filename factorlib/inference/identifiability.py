@@ -184,9 +184,9 @@ def _error_warnings(name: str, estimate: Float[np.ndarray, "7"], error: Float[np
         return
     if not (roughness_error <= ROUGHNESS_ERROR and (specular > 2 * error[3:REFLECTANCES]).any()):
         yield (
-            f"the roughness of material '{name}' cannot be determined (±{roughness_error:.2g}): no highlight stands out, "
-            "or shape and photos disagree too much. A photo in light with a small bright source, or a better mesh, "
-            "would help"
+            f"the roughness of material '{name}' cannot be determined (±{roughness_error:.2g}): no highlight "
+            "stands out, or shape and photos disagree too much. A photo in light with a small bright source, or a "
+            "better mesh, would help"
         )
     elif estimate[REFLECTANCES] <= ROUGHNESS[0] + 1e-9 and roughness_error > 0:
         yield (
