@@ -31,7 +31,8 @@ class SolveOptions(Struct, frozen=True):
     marginal likelihood supports it very strongly (log Bayes factor over 5)."""
     background: Literal["auto", "off"] = "auto"
     """Surroundings that photos show, as observations of the light; auto: with wider errors where the marginal
-    likelihood of the objects is strongly against it (log Bayes factor below -15), and at last not."""
+    likelihood of the objects is clearly against it (log Bayes factor plus two of its errors below -5), and at last
+    not."""
     ground: Literal["auto", "off"] = "auto"
     """Shadows that objects cast on the ground, as observations of the light; auto: used if they lie where the light
     that the objects tell of casts them (correlation from 0.3 on)."""
@@ -40,6 +41,6 @@ class SolveOptions(Struct, frozen=True):
     (2.67 of six lights) and their loss is a quarter higher without it."""
     distance: Literal["auto", "off"] = "auto"
     """Finite distance of a light; auto: used if the marginal likelihood supports it very strongly (log Bayes factor
-    over 5)."""
+    less two of its errors over 5)."""
     seed: Seed = 0
     """Seed of the choice of held-out regions of mirror directions, and of the observations that are drawn."""

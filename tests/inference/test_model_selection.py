@@ -8,8 +8,8 @@ import pytest
 
 from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.images.tone import curve
-from factorlib.inference import suns
-from factorlib.inference.blocks import Noise
+from factorlib.inference import model_selection, suns
+from factorlib.inference.blocks import FIT_LOSS, Noise
 from factorlib.inference.fit import FitSchedule, reliable_observations
 from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
@@ -22,9 +22,11 @@ from factorlib.inference.model_selection import (
     CLEARLY_FOR,
     CURVATURES,
     LEAST_TONE_GAIN,
+    LIGHTS_ONLY,
     VERY_STRONG,
     Losses,
     compare_models,
+    log_bayes_factors,
     near_share,
     select_distances,
     select_effects,
@@ -347,6 +349,32 @@ def test_a_light_that_is_far_is_tried_at_one_distance_alone():
     problem = JointProblem([none_held_out(block) for block in photographed_at(0.0)], OPERATOR)
     (decision,) = select_distances(problem, begun(problem, 60), QUICK, Counting()).evidence
     assert decision.log_bayes_factor < 0 and tried == [{0.0}, {CURVATURES[0]}]
+
+
+def test_the_error_of_a_log_bayes_factor_is_a_jackknife_over_clusters():
+    """Each cluster is left out in turn, and the rest stands for all."""
+    problem = JointProblem([none_held_out(block) for block in photographed_at(0.2)], OPERATOR)
+    far, run = begun(problem, 60), FitRunner(prior=PRIOR)
+    near = far.with_lights([msgspec.structs.replace(light, curvature=0.2) for light in far.point.lights])
+    fits = [run.fit("distances", problem, fit, LIGHTS_ONLY) for fit in (far, near)]
+    ((factor,), (error,)) = log_bayes_factors(problem, *fits)
+    (block,) = problem.blocks
+    number, temperature = block.clusters(), fits[0].hyperparameters[0].temperature
+    losses = [FIT_LOSS.evaluate(problem.residuals(fit.point)[0]).sum(1) / temperature for fit in fits]
+    clusters = np.unique(number)
+    rest = [len(clusters) / (len(clusters) - 1) * (losses[0] - losses[1])[number != k].sum() / 2 for k in clusters]
+    assert factor == (fits[0].light_values[0] - fits[1].light_values[0]) / 2
+    assert error == pytest.approx(np.sqrt((len(clusters) - 1) * np.var(rest)), rel=1e-3)
+
+
+def test_a_near_light_that_few_clusters_ask_for_stays_far(monkeypatch):
+    problem = JointProblem([none_held_out(block) for block in photographed_at(0.2)], OPERATOR)
+    start = begun(problem, 60)
+    (near,) = select_distances(problem, start, QUICK, FitRunner()).evidence
+    scattered = model_selection.log_bayes_factors
+    monkeypatch.setattr(model_selection, "log_bayes_factors", lambda *fits: scattered(*fits) * [[1.0], [100.0]])
+    (doubtful,) = select_distances(problem, start, QUICK, FitRunner()).evidence
+    assert near.accepted and not doubtful.accepted and near.log_bayes_factor == doubtful.log_bayes_factor
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
