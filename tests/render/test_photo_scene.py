@@ -250,6 +250,8 @@ def test_about_a_tilted_normal_the_camera_keeps_its_height_and_its_distance(stud
     places = np.array([Orbit(azimuth).world_from_camera(studio, up)[:3, 3] - studio.middle for azimuth in (0, 90, 180)])
     np.testing.assert_allclose(places @ up, np.full(3, places[0] @ up), atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(places, axis=1), np.linalg.norm(studio.middle), atol=1e-9)
+    upright = msgspec.structs.replace(studio, up=up)  # of a scene whose vertical that is, too
+    np.testing.assert_allclose(Orbit(90).world_from_camera(upright)[:3, 3] - studio.middle, places[1], atol=1e-9)
 
 
 # ── Insertion against a scene that has the object in truth ──────────────────────────────────────────────────────────
