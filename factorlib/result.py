@@ -41,6 +41,7 @@ from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
 from factorlib.recipe.read_recipe import check_recipe, files_of
 from factorlib.render.photo_scene import (
     DistantLight,
+    LightMap,
     Orbit,
     PhotoScene,
     TracedPicture,
@@ -222,7 +223,7 @@ class Result:
         _check(kinds.RelightRecipe, width=width, samples=samples)
         scene = resize_scene(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == obj)
-        traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
+        traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light, photo)), samples)
         light_photo = light if isinstance(light, str) and light in self.photos else None
         about = f"{photo}/{obj} in {light if isinstance(light, str) else 'a given light'}"
         return Picture(traced, identity_tone if light_photo is None else self._solved.tone(light_photo), about)
@@ -271,7 +272,8 @@ class Result:
         path = Path(kind)
         inputs = self._solved.inputs
         objects = {name: each.objects for name, each in self._solved.objects.items()}
-        check_recipe(recipe, path, objects, self._solved.names)
+        lights = {light.illumination for light in self._solved.lights.values()}
+        check_recipe(recipe, path, objects, lights, self._solved.names)
         recipe_files = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
         solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | recipe_files))
         with TemporaryDirectory() as out:
@@ -294,12 +296,13 @@ class Result:
             log.warning("'%s' could be %s: that of '%s' is used", name, " or ".join(others), place[0])
         return place
 
-    def _light(self, light: str | Environment) -> DistantLight:
-        if isinstance(light, Environment):
-            return light.lat_long
+    def _light(self, light: str | Environment, photo: str) -> DistantLight:
+        """Return a light as it stands in a photo; maps are upright in its world, as exported ones are."""
         if isinstance(light, str) and is_light_file(light):
-            return read_light_map(Path(light))
-        return self._solved.light(self._photo(light))
+            light = Environment(read_light_map(Path(light)))
+        if isinstance(light, Environment):
+            return LightMap(light.lat_long, self._solved.world_from_map(photo))
+        return self._solved.light(self._photo(light), photo)
 
     def __repr__(self) -> str:
         return f"{self.folder}: {len(self.photos)} photos, {self.materials!r}"

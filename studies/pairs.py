@@ -45,7 +45,7 @@ from factorlib.reading import read_text
 from factorlib.recipe.kinds import InsertRecipe
 from factorlib.render.ground import Plane
 from factorlib.render.insertion import GroundSurface, InsertionResult, insert_object
-from factorlib.render.photo_scene import DistantLight, PlacedMesh
+from factorlib.render.photo_scene import DistantLight, LightMap, PlacedMesh
 from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
@@ -106,9 +106,9 @@ class TrueSet(SolvedSet):
             }
             self.poses[photo] = replace(estimate, camera=camera, objects=objects)
 
-    def light(self, name: str) -> DistantLight:
+    def light(self, name: str, photo: str | None = None) -> DistantLight:
         """Return the true map of a photo's light."""
-        return read_true_light(self.folder / self.truth.illumination[name], name).astype(float)
+        return LightMap(read_true_light(self.folder / self.truth.illumination[name], name).astype(float))
 
     def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the plane y = 0 of a chair's own frame, on which it stands."""

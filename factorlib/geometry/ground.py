@@ -44,6 +44,7 @@ def resting_plane(
     placed: Float[np.ndarray, "v 3"],
     rotation: Float[np.ndarray, "3 3"],
     uprights: Float[np.ndarray, "k 3"],
+    most_tilt_deg: float = MOST_TILT_DEG,
 ) -> Plane | None:
     """Return the plane on which an object rests; None if it is flat, or no stable pose is upright in its photos.
 
@@ -51,13 +52,14 @@ def resting_plane(
         vertices: Vertices in the object's frame.
         placed: The same vertices in the frame of the result.
         rotation: Rotation from the object's frame to that of the result.
-        uprights: Unit up vectors of the cameras that see the object, in its frame.
+        uprights: Unit up vectors of the cameras that see the object, or of its world, in its frame.
+        most_tilt_deg: Largest mean angle between the plane's normal and these, degrees.
     """
     try:
         ups, chances = stable_poses(vertices)
     except QhullError:  # a flat object has no hull
         return None
-    upright = (ups @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
+    upright = (ups @ uprights.T).mean(axis=1) > np.cos(np.radians(most_tilt_deg))
     if not upright.any():
         return None
     # the likeliest pose among the upright ones; the plane touches the lowest vertex

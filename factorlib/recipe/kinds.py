@@ -5,7 +5,8 @@
     lights: [hall, my_studio.exr]
 
 Photos, objects, materials and lights have their names in dataset.yaml.  Files are relative to the recipe.
-User-supplied materials stand in a table, a JSON file like materials.json, of which only the reflectances are read.
+User-supplied materials stand in a table: in the recipe, or in a JSON file like materials.json, of which only the
+reflectances are read.
 Angles are in degrees, sizes in pixels, colours linear Rec. 709.
 """
 
@@ -27,6 +28,7 @@ Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
 PoseRow = tuple[Number, Number, Number, Number]
+Table = str | dict[str, GivenMaterial] | None  # a file, or materials by name
 LIGHT_FILES = (".hdr", ".exr")
 BALL = "ball"
 MOST_REFLECTED = 0.999  # largest max diffuse + max specular: with more, light between surfaces does not decay
@@ -68,8 +70,11 @@ class PhotoRecipe(BaseRecipe, frozen=True, kw_only=True):
 class ResizedRecipe(PhotoRecipe, frozen=True, kw_only=True):
     """Fields of recipes whose pictures may differ from the photo in size."""
 
+    across: Pixels | None = None
+    """Pixels along the longer side of the objects, to which the picture is cropped; by default 640, or as many as the
+    photo's file has if these are fewer."""
     width: Pixels | None = None
-    """Width of the pictures; by default that of the photo after downsampling by the pipeline."""
+    """Width of the pictures, which then show the whole frame of the photo."""
 
 
 class BackgroundRecipe(ResizedRecipe, frozen=True, kw_only=True):
@@ -133,9 +138,11 @@ class RelightRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="relight"):
     """Recipe of the photo's objects in other lights."""
 
     lights: list[str] = []
-    """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); by default all other photos."""
+    """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); by default the first photo of
+    every other light.  They stand upright in the world of the photo if it has `world_from_camera`, else in its
+    camera's frame."""
     rotate: Degrees = 0.0
-    """Rotation of those lights about the camera's upright axis."""
+    """Rotation of those lights about the vertical of that frame."""
 
 
 class TransferRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="transfer"):
@@ -143,12 +150,16 @@ class TransferRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="transfer"):
 
     materials: dict[str, str]
     """Replacement by material of the data set: another material of the data set, or one of `table`."""
-    table: str | None = None
-    """File of user-supplied materials, like materials.json."""
+    table: Table = None
+    """User-supplied materials by name, or a file of them, like materials.json."""
 
 
-class Polish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Specular reflection of a ground whose diffuse colour the photo shows."""
+class GroundFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Height of the ground, and its specular reflection; the photo shows its diffuse colour."""
+
+    drop: Annotated[float, msgspec.Meta(ge=-10, le=100)] = 0.0
+    """Depth of the ground below the plane that is found or given, in heights of the object beside: the height of the
+    pedestal on which that stands."""
 
     specular: Shares = (0.0, 0.0, 0.0)
     """k_s of a reflective ground, such as a polished floor."""
@@ -164,8 +175,8 @@ class InsertRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="insert"):
     material: str | dict[str, str] | None = None
     """Material of the data set or of `table`, or replacements by material for parts of a mesh of the data set.
     By default the mesh keeps its own materials; a file or the ball gets the data set's first."""
-    table: str | None = None
-    """File of user-supplied materials, like materials.json."""
+    table: Table = None
+    """User-supplied materials by name, or a file of them, like materials.json."""
     beside: str | None = None
     """Object on whose ground the new one stands; by default the photo's first."""
     at: Vec2 | None = None
@@ -177,8 +188,8 @@ class InsertRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="insert"):
     """Rotation about the ground's normal."""
     up: Literal["x", "y", "z"] = "y"
     """The axis of a mesh file that points upward."""
-    ground: Polish = Polish()
-    """Specular reflection of the ground beside its diffuse colour."""
+    ground: GroundFields = GroundFields()
+    """Height and specular reflection of the ground."""
 
 
 class GridRecipe(BaseRecipe, frozen=True, kw_only=True, tag="grid"):
@@ -247,12 +258,31 @@ def read_table(path: Path) -> dict[str, GivenMaterial]:
             table[name] = msgspec.convert(fields, GivenMaterial)
         except msgspec.ValidationError as error:
             raise InputError(str(error), file=path, key=key, cure=CURE) from None
-        total = max(table[name].diffuse) + max(table[name].specular)
+    return _checked(table, path, "materials")
+
+
+def materials_of(table: Table, file: Path | None) -> dict[str, GivenMaterial]:
+    """Return the materials of a table, which stands in the recipe or in a file; errors as for `read_table`.
+
+    Args:
+        table: field of the recipe
+        file: the file that it names; for a table in the recipe, the recipe, which errors name
+    """
+    if isinstance(table, str):
+        assert file is not None
+        return read_table(file)
+    return _checked(table or {}, file, "table")
+
+
+def _checked(table: dict[str, GivenMaterial], file: Path | None, key: str) -> dict[str, GivenMaterial]:
+    """Return the table; InputError if a material reflects more light than arrives."""
+    for name, material in table.items():
+        total = max(material.diffuse) + max(material.specular)
         if total > MOST_REFLECTED:
             raise InputError(
                 f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives",
-                file=path,
-                key=key,
+                file=file,
+                key=f"{key}.{name}",
                 cure=f"reduce the sum to at most {MOST_REFLECTED}",
             )
     return table

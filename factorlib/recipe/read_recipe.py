@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from factorlib.dataset.check import MESHES
@@ -11,7 +11,7 @@ from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import Dataset, MeshInstance
 from factorlib.errors import InputError, did_you_mean
 from factorlib.recipe import kinds
-from factorlib.recipe.kinds import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, read_table
+from factorlib.recipe.kinds import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, materials_of
 from factorlib.yamlfile import load_yaml, read_yaml
 
 
@@ -27,12 +27,17 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
             did_you_mean(str(kind), KINDS),
         )
     recipe = read_yaml(path, KINDS[kind])
-    check_recipe(recipe, path, {photo.name: photo.objects for photo in dataset.spec.photos}, dataset.spec.materials)
+    objects = {photo.name: photo.objects for photo in dataset.spec.photos}
+    check_recipe(recipe, path, objects, {photo.light for photo in dataset.spec.photos}, dataset.spec.materials)
     return recipe
 
 
 def check_recipe(
-    recipe: AnyRecipe, path: Path, objects: Mapping[str, Sequence[MeshInstance]], materials: list[str]
+    recipe: AnyRecipe,
+    path: Path,
+    objects: Mapping[str, Sequence[MeshInstance]],
+    lights: Collection[str],
+    materials: list[str],
 ) -> None:
     """Check a recipe against a data set.
 
@@ -40,6 +45,7 @@ def check_recipe(
         recipe: the recipe
         path: the recipe's file, which errors name and to which its files are relative
         objects: objects of each photo
+        lights: names of the lights of all photos
         materials: materials of the data set
 
     Raises:
@@ -61,12 +67,17 @@ def check_recipe(
         _check_names(refuse, "lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
     if isinstance(recipe, kinds.RelightRecipe):
         _check_distinct(refuse, "lights", [Path(name).stem for name in recipe.lights], "light")
-        if not recipe.lights and len(photos) == 1:
-            refuse("lights", "there is no other photo whose light could be used", "name a file (.hdr, .exr)")
+        if not recipe.lights and len(lights) == 1:
+            refuse(
+                "lights",
+                f"the photos share one light, '{next(iter(lights))}', so there is no other to relight by",
+                "name light maps: `lights: [studio.hdr]`, lat-long .hdr or .exr files, relative to the recipe",
+            )
     if isinstance(recipe, kinds.TransferRecipe | kinds.GridRecipe):
         _check_names(refuse, "materials", recipe.materials, materials, "material")
     if isinstance(recipe, kinds.TransferRecipe | kinds.InsertRecipe) and recipe.table is not None:
-        materials = [*materials, *read_table(path.parent / recipe.table)]
+        table = recipe.table
+        materials = [*materials, *materials_of(table, path.parent / table if isinstance(table, str) else path)]
     if isinstance(recipe, kinds.TransferRecipe):
         _check_names(refuse, "materials", recipe.materials.values(), materials, "material")
     if isinstance(recipe, kinds.InsertRecipe):
@@ -85,9 +96,16 @@ def _check_distinct(refuse: Refusal, key: str, names: list[str], kind: str) -> N
 
 
 def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal) -> None:
-    """Check the photos, the camera and the assumed sun of a recipe."""
+    """Check the photos, the size, the camera and the assumed sun of a recipe."""
     _check_names(refuse, "photos", recipe.photos, photos, "photo")
     _check_distinct(refuse, "photos", recipe.photos, "photo")
+    if isinstance(recipe, kinds.ResizedRecipe):
+        refuse.refuse_if(
+            recipe.across is not None and recipe.width is not None,
+            "across",
+            "cannot be combined with width",
+            "keep across, which crops to the objects, or width, which shows the whole frame",
+        )
     if isinstance(recipe, kinds.ViewRecipe) and recipe.camera is not None:
         _check_camera(recipe, recipe.camera, photos, refuse)
     if recipe.sun is None:
@@ -157,6 +175,6 @@ def _check_new_object(
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:
     """Return the absolute paths of the files that a recipe names, by the names it uses."""
     named = [name for name in getattr(recipe, "lights", []) if is_light_file(name)]
-    named += [name for name in [getattr(recipe, "table", None)] if name is not None]
+    named += [name for name in [getattr(recipe, "table", None)] if isinstance(name, str)]
     named += [name for name in [getattr(recipe, "mesh", "")] if is_mesh_file(name)]
     return {name: Path(os.path.abspath(path.parent / name)) for name in named}

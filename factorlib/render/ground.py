@@ -1,4 +1,6 @@
-"""Objects on the ground plane of a photo, which dataset.yaml gives, or on which an object rests.
+"""Objects on the ground plane of a photo, which dataset.yaml gives, or on which an object rests or stands.
+
+Where the dataset has an upright world, the ground is level in it, within the error of its horizon.
 
 Objects on a grey floor, which receives their shadow and fades out around them, are w L₁ + (1 − w) L₀, w = max(W, f).
 L₁ and L₀ are path-traced with the floor and without it.  W is the share of a pixel that objects fill.  f falls from 1
@@ -19,7 +21,27 @@ from factorlib.tracing.scene import bsdf, rigid, transform
 
 REACH = 3.0  # radius of a floor, in half extents of the objects
 SOLID = 0.3  # share of the radius within which the floor does not fade
-HAIR = 1e-4  # depth of the floor below the plane, in half extents: surfaces must not touch
+LEVEL_DEG = 5.0  # error of a world's horizon: cameras roll by about 3° (`factorlib.dataset.sources.external_cameras`)
+HAIR = 3e-5  # depth of the floor below the plane, in its radii: surfaces must not touch
+
+
+def level_ground(placed: PlacedMesh, up: Float[np.ndarray, "3"]) -> tuple[Plane, str]:
+    """Return the plane below an object in an upright world, and how it was decided.
+
+    It is that of the object's likeliest stable pose within LEVEL_DEG of upright.  If there is none, as for many a rough
+    hull, it is level and touches the object's lowest point.
+
+    Args:
+        placed: the object
+        up: unit upright direction, in the world
+    """
+    rotation = placed.rotation
+    plane = resting_plane(placed.mesh.vertices, placed.vertices, rotation, (rotation.T @ up)[None], LEVEL_DEG)
+    if plane is not None:
+        return plane, f"where '{placed.name}' rests upright in the world of the photos"
+    vertices = placed.vertices
+    lowest = vertices[np.argmin(vertices @ up)]
+    return Plane(up, lowest), f"level in the world of the photos, at the lowest point of '{placed.name}'"
 
 
 def ground_below(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
@@ -32,9 +54,7 @@ def ground_below(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None =
     Raises:
         InputError: The object has no stable pose that is upright in its photos.
     """
-    # rotation of the similarity, without its scale
-    rotation = placed.world_from_object[:3, :3]
-    rotation = rotation / np.cbrt(np.linalg.det(rotation))
+    rotation = placed.rotation
     uprights = rotation.T[:, 1][None] if uprights is None else uprights
     plane = resting_plane(placed.mesh.vertices, placed.vertices, rotation, uprights)
     if plane is None:
@@ -47,8 +67,21 @@ def ground_below(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None =
 
 
 def height_over(plane: Plane, placed: PlacedMesh) -> float:
-    """Return the height of an object's highest vertex above the plane."""
-    return float(((placed.vertices - plane.point) @ plane.normal).max())
+    """Return the extent of an object along the plane's normal."""
+    return float(np.ptp(placed.vertices @ plane.normal))
+
+
+def floor_disc(scene: PhotoScene, plane: Plane) -> tuple[Float[np.ndarray, "3"], float]:
+    """Return the middle and the radius of the floor below the objects of a scene."""
+    return plane.onto(scene.middle[None])[0], REACH * float(np.ptp(scene.points, axis=0).max()) / 2
+
+
+def floor_rim(scene: PhotoScene, plane: Plane) -> Float[np.ndarray, "360 3"]:
+    """Return points of the rim of the floor, in the world."""
+    foot, radius = floor_disc(scene, plane)
+    angle = np.radians(np.arange(360))
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(360)], axis=1)
+    return foot + radius * circle @ rotation_between(np.array([0.0, 0.0, 1.0]), plane.normal).T
 
 
 def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -101,11 +134,9 @@ def on_floor(
     """
     if (world_from_camera[:3, 3] - plane.point) @ plane.normal <= 0:
         raise InputError("the camera is below the floor", key="floor", cure="look from higher, or leave the floor out")
-    points = np.concatenate([each.vertices for each in scene.objects])
-    extent = float(np.ptp(points, axis=0).max()) / 2
-    foot = plane.onto(scene.middle[None])[0]
+    foot, radius = floor_disc(scene, plane)
     grey = Reflectance((reflectance,) * 3, (0.0,) * 3, 1.0)
-    floor = disk(foot - HAIR * extent * plane.normal, plane.normal, REACH * extent, grey)
+    floor = disk(foot - HAIR * radius * plane.normal, plane.normal, radius, grey)
     # L₀, L₁ and W
     without = traced_photo(scene, samples, world_from_camera)
     with_floor = traced_photo(scene, samples, world_from_camera, {"floor": floor})
@@ -114,7 +145,7 @@ def on_floor(
     eye = world_from_camera[:3, 3]
     rays = (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)
     points = Plane(plane.normal, plane.point - eye).hit(rays) + eye
-    distance = np.linalg.norm(points - foot, axis=-1).reshape(coverage.shape) / (REACH * extent)
+    distance = np.linalg.norm(points - foot, axis=-1).reshape(coverage.shape) / radius
     fade = smooth_step((1 - np.nan_to_num(distance, nan=np.inf)) / (1 - SOLID))
     weight = np.maximum(coverage, fade)[..., None]
     return weight * with_floor + (1 - weight) * without

@@ -82,11 +82,13 @@ class GroundSurface(msgspec.Struct, frozen=True):
     Attributes:
         diffuse: Lambertian reflectance, None if it is unknown
         polish: specular part of a reflective ground
+        source: how the plane was decided, after "the ground is"
     """
 
     plane: Plane
     diffuse: tuple[float, float, float] | None = None
     polish: Reflectance | None = None
+    source: str = "given"
 
 
 class InsertionScene(msgspec.Struct, frozen=True, dict=True):

@@ -1,8 +1,8 @@
 """Path-traced scenes of a photo's objects, camera and light, for the same view, another view, or another light.
 
 World    The photo's camera frame turned y-up: x right, y up, z toward the viewer, camera at the origin.
-Light    Infinitely far, given in the photo's camera axes (lobes) or in the world (a lat-long map).
-Upright  The camera's own y.
+Light    Infinitely far, given in the photo's camera axes (lobes) or as a lat-long map with its rotation to the world.
+Upright  `up` of the scene: that of the dataset's world, in which cameras stand; without one, the camera's own y.
 Picture  Linear radiance times coverage, and coverage; shown and written by `TracedPicture`.
 """
 
@@ -21,13 +21,13 @@ from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.images.exr import write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
-from factorlib.light.latlong import rotate_map
 from factorlib.light.lobes import Lobes, lobe_energy
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import (
     NARROWEST,
+    Matrix,
     bsdf,
     envmap,
     envmap_of_nodes,
@@ -39,18 +39,34 @@ from factorlib.tracing.scene import (
     rigid,
     sensor,
     shape,
+    transform,
 )
 
 UP = np.array([0.0, 1.0, 0.0])
+ACROSS = 640  # pixels across the objects of a cropped picture, where the photo has as many
 NEAR = 1e-3  # near clipping distance, in distances of the objects
 FAR = 3e3  # distance of suns, in sizes of the scene
 LOBE_ROWS = 128  # rows of Mitsuba's map of lobes
 MAP_ROWS = 1024  # rows of Mitsuba's map of a lat-long map
 
 LIGHT_SAMPLES = 16  # samples per pixel of the light behind objects, which is smooth
+MARGIN = 0.05  # border about the objects in a cropped picture, in longer sides of their box
 CAMERA_POSE = rigid(YUP_FROM_CAMERA, np.zeros(3))  # the photo's camera in the world
 
-DistantLight = Lobes | Float[np.ndarray, "h w 3"]
+
+class LightMap(msgspec.Struct, frozen=True):
+    """A lat-long map of distant light, in the layout of `factorlib.conventions`.
+
+    Attributes:
+        radiance: linear Rec. 709
+        world_from_map: rotation from the map's y-up frame to the world
+    """
+
+    radiance: Float[np.ndarray, "h w 3"]
+    world_from_map: Float[np.ndarray, "3 3"] = np.eye(3)
+
+
+DistantLight = Lobes | LightMap
 
 
 class PlacedMesh(msgspec.Struct, frozen=True):
@@ -67,6 +83,12 @@ class PlacedMesh(msgspec.Struct, frozen=True):
     world_from_object: Float[np.ndarray, "4 4"]
 
     @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """The rotation of the similarity, without its scale."""
+        rotation = self.world_from_object[:3, :3]
+        return rotation / np.cbrt(np.linalg.det(rotation))
+
+    @property
     def vertices(self) -> Float[np.ndarray, "v 3"]:
         """The vertices in the world frame."""
         return self.mesh.vertices @ self.world_from_object[:3, :3].T + self.world_from_object[:3, 3]
@@ -77,6 +99,7 @@ class PhotoScene(msgspec.Struct, frozen=True):
 
     Attributes:
         max_depth: ALL_BOUNCES or DIRECT, as in the solve
+        up: unit upright direction, in the world
     """
 
     camera: Camera
@@ -84,11 +107,17 @@ class PhotoScene(msgspec.Struct, frozen=True):
     light: DistantLight
     materials: Mapping[str, Reflectance]
     max_depth: int = ALL_BOUNCES
+    up: Float[np.ndarray, "3"] = UP
+
+    @property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """The vertices of all objects, in the world."""
+        return np.concatenate([each.vertices for each in self.objects])
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
         """The centre of the bounding box of all objects."""
-        points = np.concatenate([each.vertices for each in self.objects])
+        points = self.points
         return (points.min(axis=0) + points.max(axis=0)) / 2
 
     @property
@@ -127,7 +156,8 @@ def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
     `size` is the size of the scene, as in `PhotoScene.size`.
     """
     if not isinstance(light, Lobes):
-        return {"light": envmap(light, finer=max(1, MAP_ROWS // len(light)))}
+        emitter = envmap(light.radiance, finer=max(1, MAP_ROWS // len(light.radiance)))
+        return {"light": emitter | {"to_world": transform(rigid(light.world_from_map, np.zeros(3)))}}
     # lobes narrower than Mitsuba's lattice can hold become spheres far away
     narrow = light.sharpness * NARROWEST * (np.pi / (LOBE_ROWS - 1)) ** 2 > 1
     entries = {"light": envmap_of_nodes(mitsuba_map(light.take(~narrow), LOBE_ROWS, 2 * LOBE_ROWS))}
@@ -160,15 +190,61 @@ def visible_window(
     points: Float[np.ndarray, "n 3"], camera: Camera, world_from_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[slice, slice]:
     """Return the rows and columns that show the points, at least one of each; all if a point is behind the camera."""
-    points = (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
     size = np.array([camera.width, camera.height])
-    if points[:, 2].min() <= 0:
-        return slice(0, camera.height), slice(0, camera.width)
-    pixels = camera.project(points)
-    low = np.clip(np.floor(pixels.min(axis=0)), 0, size - 1).astype(int)
-    high = np.clip(np.ceil(pixels.max(axis=0)), low + 1, size).astype(int)
+    low, high = projected_box(points, camera, world_from_camera)
+    low = np.clip(np.floor(low), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(high), low + 1, size).astype(int)
     columns, rows = (slice(*span) for span in np.stack([low, high], axis=1).tolist())
     return rows, columns
+
+
+def projected_box(
+    points: Float[np.ndarray, "n 3"], camera: Camera, world_from_camera: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return the least and largest x and y of the points in pixels, also outside the picture.
+
+    It is the whole picture if a point is behind the camera.
+    """
+    points = (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    if points[:, 2].min() <= 0:
+        return np.zeros(2), np.array([camera.width, camera.height], float)
+    pixels = camera.project(points)
+    return pixels.min(axis=0), pixels.max(axis=0)
+
+
+def crop_to_objects(
+    scene: PhotoScene,
+    across: int | None,
+    finest: float,
+    poses: Sequence[Float[np.ndarray, "4 4"]] = (CAMERA_POSE,),
+    floor: Float[np.ndarray, "n 3"] | None = None,
+) -> tuple[PhotoScene, list[float]]:
+    """Return the scene with a camera that sees its objects alone, and that crop in pixels of the scene's camera.
+
+    Args:
+        scene: the scene
+        across: pixels along the longer side of the objects' box; None: `ACROSS`, or fewer where `finest` has fewer
+        finest: pixels of the photo's file per pixel of the scene's camera
+        poses: poses of the camera, all of which get the same crop
+        floor: points about the objects that the crop shows too, as far as the picture of the scene's camera does
+
+    Returns:
+        The scene, and the left, top, width and height of its picture.
+    """
+    boxes = np.array([projected_box(scene.points, scene.camera, pose) for pose in poses])
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    longer = float((high - low).max())
+    pixel = max(longer / ACROSS, 1 / finest) if across is None else longer / across
+    low, high = low - MARGIN * longer, high + MARGIN * longer
+    if floor is not None:
+        size = np.array([scene.camera.width, scene.camera.height])
+        boxes = np.array([projected_box(floor, scene.camera, pose) for pose in poses])
+        low = np.minimum(low, boxes[:, 0].min(axis=0).clip(0, size))
+        high = np.maximum(high, boxes[:, 1].max(axis=0).clip(0, size))
+    width, height = np.ceil((high - low) / pixel).astype(int).tolist()
+    left, top = low.tolist()
+    camera = scene.camera.window(left, top, pixel, width, height)
+    return msgspec.structs.replace(scene, camera=camera), [left, top, pixel * width, pixel * height]
 
 
 def crop_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
@@ -194,8 +270,7 @@ def traced_photo(
         Linear radiance times coverage, and coverage: the share of a pixel that objects fill.
     """
     entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **floor}
-    points = np.concatenate([each.vertices for each in scene.objects])
-    window = visible_window(points, scene.camera, world_from_camera)
+    window = visible_window(scene.points, scene.camera, world_from_camera)
     if floor:
         window = slice(0, scene.camera.height), slice(0, scene.camera.width)
     view = sensor(crop_camera(scene.camera, *window), world_from_camera, near_clip=scene.near_clip, alpha=True)
@@ -257,8 +332,9 @@ class Orbit(msgspec.Struct, frozen=True):
     elevation_deg: float = 0.0
     zoom: float = 1.0
 
-    def world_from_camera(self, scene: PhotoScene, up: Float[np.ndarray, "3"] = UP) -> Float[np.ndarray, "4 4"]:
-        """Return the pose of the moved camera; `up` is the unit axis of the azimuth, in the world."""
+    def world_from_camera(self, scene: PhotoScene, up: Float[np.ndarray, "3"] | None = None) -> Matrix:
+        """Return the pose of the moved camera; `up` is the unit axis of the azimuth, by default the scene's."""
+        up = scene.up if up is None else up
         middle = scene.middle
         right = np.cross(up, -middle)
         right /= np.linalg.norm(right)
@@ -268,14 +344,12 @@ class Orbit(msgspec.Struct, frozen=True):
         return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / self.zoom)
 
 
-def rotate_light(light: DistantLight, angle_deg: float) -> DistantLight:
-    """Return the light turned about the upright axis of the world."""
-    if angle_deg == 0:
-        return light  # resampling would blur a map
-    turn = rotation_of_vector(np.radians(angle_deg) * UP)
+def rotate_light(light: DistantLight, angle_deg: float, up: Float[np.ndarray, "3"] = UP) -> DistantLight:
+    """Return the light turned about an upright axis of the world: about +y, at 90° +z goes to +x."""
+    turn = rotation_of_vector(np.radians(angle_deg) * up)
     if isinstance(light, Lobes):
         return light.rotate(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)
-    return rotate_map(light, turn, finer=2)
+    return msgspec.structs.replace(light, world_from_map=turn @ light.world_from_map)
 
 
 Radiance = Float[np.ndarray, "h w 3"]

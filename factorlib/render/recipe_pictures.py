@@ -6,7 +6,7 @@ caption of the picture and other facts about it, if there are any.
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,15 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import without_paint
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import AnyRecipe, is_light_file
-from factorlib.render.ground import on_floor
-from factorlib.render.insertion import NEW, InsertionScene, compare_shadow, insert_object
+from factorlib.render.ground import floor_rim, height_over, on_floor
+from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compare_shadow, insert_object
 from factorlib.render.photo_scene import (
     Orbit,
     PhotoScene,
+    PlacedMesh,
     TracedPicture,
     before_light,
+    crop_to_objects,
     lit_ball,
     resize_scene,
     rotate_light,
@@ -49,6 +51,7 @@ SUN = (
     "and holds {sun.strength:.0%} of the light's energy, which is kept."
 )
 CONTRADICTED = "the ground that the photo shows is not shaded as the recovered light predicts"
+PEDESTAL = " (if the photo's objects stand above the floor, lower the ground: `ground: {drop: …}`)"
 
 
 def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
@@ -72,12 +75,12 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
             report = partial(_report_photo, progress, index, len(photos), photo)
             report(0)
             facts = WRITERS[type(recipe)](recipe, results, photo, out, report) or {}
-            captions = [facts.pop("caption")] if facts else []
+            captions = [facts.pop("caption")] if "caption" in facts else []
             if recipe.sun is not None:
                 facts["assumed_sun"] = msgspec.to_builtins(recipe.sun)
                 captions.append(SUN.format(sun=recipe.sun))
             if facts:
-                write_json(out / f"{photo}.json", {**facts, "caption": " ".join(captions)})
+                write_json(out / f"{photo}.json", facts | ({"caption": " ".join(captions)} if captions else {}))
         except InputError as error:
             if recipe.photos:
                 raise
@@ -96,6 +99,7 @@ def _report_photo(progress: Progress, done: int, total: int, photo: str, share: 
 
 Report = Callable[[float], None]
 View = Callable[..., Float[np.ndarray, "4 4"]]
+STILL: Sequence[View] = [Orbit().world_from_camera]
 
 
 def write_resynthesis(
@@ -151,7 +155,8 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
     polished = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
     polish = polished if any(recipe.ground.specular) else None
-    ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
+    ground = lowered_ground(results.ground(photo, neighbour), neighbour, recipe.ground.drop)
+    ground = msgspec.structs.replace(ground, polish=polish)
     if ground.plane.point @ ground.plane.normal >= 0:  # the camera stands at the origin
         raise InputError(
             f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, "
@@ -181,6 +186,16 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
     return InsertionScene(scene, ground, new, requested, spot, moved)
 
 
+def lowered_ground(ground: GroundSurface, neighbour: PlacedMesh, drop: float) -> GroundSurface:
+    """Return the ground lowered along its normal by `drop` heights of an object."""
+    if drop == 0:
+        return ground
+    plane = ground.plane
+    point = plane.point - drop * height_over(plane, neighbour) * plane.normal
+    source = f"{ground.source}, lowered by {drop:g} of its heights as the recipe says"
+    return msgspec.structs.replace(ground, plane=msgspec.structs.replace(plane, point=point), source=source)
+
+
 def write_insertion(
     recipe: kinds.InsertRecipe, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> dict[str, Any]:
@@ -203,22 +218,46 @@ def write_insertion(
     covered = results.photo_mask(photo)
     result = insert_object(insertion, linear, covered, recipe.samples)
     match = compare_shadow(insertion, result, linear, covered)
+    hint = PEDESTAL if match.doubtful and recipe.ground.drop == 0 and results.grounds[photo].ground is None else ""
     if match.doubtful:
-        log.warning("%s: do not trust the shadow: %s", photo, CONTRADICTED)
+        log.warning("%s: do not trust the shadow: %s%s", photo, CONTRADICTED, hint)
     # Pixels that the new object does not change keep the photo's values exactly.
     edited = np.where(result.composite == linear, results.photo(photo), results.tone(photo)(result.composite))
     _write_opaque(out / photo, add_grain(edited, results.photo(photo), result.coverage))
     pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
-    source = "that of dataset.yaml"
-    if results.grounds[photo].ground is None:
-        source = f"where '{recipe.beside or insertion.scene.objects[0].name}' would come to rest"
     moved = np.linalg.norm(insertion.spot.point - insertion.requested.point) / insertion.spot.height
     return {
         "at": pixel.round(1).tolist(),
         "moved": float(moved),
         "shadow": msgspec.to_builtins(match),
-        "caption": f"{insertion.moved} The ground is {source}. {match}".strip(),
+        "caption": f"{insertion.moved} The ground is {insertion.ground.source}. {match}{hint}".strip(),
     }
+
+
+def framed_scene(
+    recipe: kinds.ResizedRecipe, results: SolvedSet, photo: str, scene: PhotoScene, views: Sequence[View]
+) -> tuple[PhotoScene, dict[str, Any]]:
+    """Return the scene with the camera of the recipe's pictures: the whole frame, or the part with the objects.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        photo: name of the photo
+        scene: the photo's scene
+        views: return the poses of the cameras of all pictures that share the frame
+
+    Returns:
+        The scene, and `crop`: left, top, width and height of the part, in pixels of the photo's file.
+    """
+    if recipe.width is not None:
+        return resize_scene(scene, recipe.width), {}
+    has_floor = isinstance(recipe, kinds.BackgroundRecipe) and recipe.floor is not None
+    plane = results.ground(photo, scene.objects[0]).plane if has_floor else None
+    poses = [view(scene, scene.up if plane is None else plane.normal) for view in views]
+    factor = results.poses[photo].camera.factor
+    rim = None if plane is None else floor_rim(scene, plane)
+    cropped, crop = crop_to_objects(scene, recipe.across, factor, poses, rim)
+    return cropped, {"crop": [round(factor * each, 2) for each in crop]}
 
 
 def render_view(
@@ -254,8 +293,8 @@ def render_view(
     return before_light(traced, scene, pose) if recipe.background == "light" else traced
 
 
-def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """Write the objects alone, from another view.
+def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
+    """Write the objects alone, from another view; the camera of another photo or a pose shows its whole frame.
 
     Args:
         recipe: the recipe to render
@@ -263,15 +302,22 @@ def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Pa
         photo: name of the photo
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
+
+    Returns:
+        The crop.
     """
+    crop: dict[str, Any] = {}
     scene = results.scene(photo, recipe.sun)
     view: View = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
     if recipe.camera is not None:
         camera, pose = results.camera(photo, recipe.camera)
         scene = msgspec.structs.replace(scene, camera=camera)
         view = lambda *_: pose  # noqa: E731
-    traced = render_view(recipe, results, photo, resize_scene(scene, recipe.width), view)
+    if recipe.camera is None or recipe.across is not None or recipe.width is not None:
+        scene, crop = framed_scene(recipe, results, photo, scene, [view])
+    traced = render_view(recipe, results, photo, scene, view)
     _write_transparent(out / photo, TracedPicture(traced, results.tone(photo)))
+    return crop
 
 
 def write_animation(
@@ -288,15 +334,17 @@ def write_animation(
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    scene = resize_scene(results.scene(photo, recipe.sun), recipe.width)
+    turns = 360 * np.arange(recipe.frames) / recipe.frames
+    views = [Orbit(float(degrees)).world_from_camera for degrees in turns]
+    is_turntable = isinstance(recipe, kinds.TurntableRecipe)
+    scene, _ = framed_scene(recipe, results, photo, results.scene(photo, recipe.sun), views if is_turntable else STILL)
     pixels = []
-    for k in range(recipe.frames):
+    for k, degrees in enumerate(turns):
         report(k / recipe.frames)
-        degrees = 360 * k / recipe.frames
         if isinstance(recipe, kinds.TurntableRecipe):
-            traced = render_view(recipe, results, photo, scene, Orbit(degrees).world_from_camera)
+            traced = render_view(recipe, results, photo, scene, views[k])
         else:
-            turned = msgspec.structs.replace(scene, light=rotate_light(scene.light, degrees))
+            turned = msgspec.structs.replace(scene, light=rotate_light(scene.light, degrees, scene.up))
             traced = traced_photo(turned, recipe.samples)
         pixels.append(TracedPicture(traced, results.tone(photo)).rgba())
     (out / photo).mkdir(parents=True)
@@ -306,7 +354,9 @@ def write_animation(
     write_mp4(out / f"{photo}.mp4", pixels, recipe.seconds)
 
 
-def write_relit(recipe: kinds.RelightRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
+def write_relit(
+    recipe: kinds.RelightRecipe, results: SolvedSet, photo: str, out: Path, report: Report
+) -> dict[str, Any]:
     """Write the objects in the lights of other photos or of files.
 
     The light of a photo comes with that photo's tone curve.  The light of a file is exposed for the objects.
@@ -317,16 +367,24 @@ def write_relit(recipe: kinds.RelightRecipe, results: SolvedSet, photo: str, out
         photo: name of the photo
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
+
+    Returns:
+        The crop, and a caption with the frame in which maps stand.
     """
-    scene = resize_scene(results.scene(photo), recipe.width)
-    lights = recipe.lights or [name for name in results.photos if name != photo]
+    scene, crop = framed_scene(recipe, results, photo, results.scene(photo), STILL)
+    lights = recipe.lights or results.other_lights(photo)
     for k, name in enumerate(lights):
         report(k / len(lights))
-        lit = msgspec.structs.replace(scene, light=rotate_light(results.light(name), recipe.rotate))
+        lit = msgspec.structs.replace(scene, light=rotate_light(results.light(name, photo), recipe.rotate, scene.up))
         traced = render_view(recipe, results, photo, lit)
         file = is_light_file(name)
         relit = TracedPicture(traced).with_exposure() if file else TracedPicture(traced, results.tone(name))
         _write_transparent(out / photo / Path(name).stem, relit)
+    if not any(map(is_light_file, lights)):
+        return crop
+    has_world = results.lights[photo].world_from_camera is not None
+    frame = "the world of the photos" if has_world else "the camera's frame, for the photo has no world"
+    return {**crop, "caption": f"Light maps are upright in {frame}, turned by {recipe.rotate:g}°."}
 
 
 WRITERS: dict[type, Callable[[Any, SolvedSet, str, Path, Report], dict[str, Any] | None]] = {

@@ -20,10 +20,10 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, scale_mesh, without_paint
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
-from factorlib.recipe.kinds import BALL, AssumedSun, ViewCamera, is_light_file, is_mesh_file, read_table
-from factorlib.render.ground import ground_below
+from factorlib.recipe.kinds import BALL, AssumedSun, Table, ViewCamera, is_light_file, is_mesh_file, materials_of
+from factorlib.render.ground import ground_below, level_ground
 from factorlib.render.insertion import GroundSurface
-from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, identity_tone, with_sun
+from factorlib.render.photo_scene import DistantLight, LightMap, PhotoScene, PlacedMesh, Tone, identity_tone, with_sun
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -103,7 +103,7 @@ class SolvedSet:
         if sun is not None:
             assert isinstance(light, Lobes)  # a photo's, and no map of a file
             light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
-        return PhotoScene(camera, placed, light, self.materials, depth)
+        return PhotoScene(camera, placed, light, self.materials, depth, self.world_from_map(photo)[:, 1])
 
     def camera(self, photo: str, view: ViewCamera) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
         """Return the camera of a view of a photo's objects, and its pose in the world of the photo's scene.
@@ -134,9 +134,16 @@ class SolvedSet:
 
     def sun_axis(self, photo: str, sun: AssumedSun) -> Float[np.ndarray, "3"]:
         """Return the unit direction to a sun in the photo's camera axes."""
+        direction = np.array(sun.direction) / np.linalg.norm(sun.direction)
+        return YUP_FROM_CAMERA @ self.world_from_map(photo) @ direction
+
+    def world_from_map(self, photo: str) -> Float[np.ndarray, "3 3"]:
+        """Return the rotation from the frame of the photo's exported light to the world of the photo's scene.
+
+        Its second column points up: along −y of the dataset's world, or of the camera if the photo has no world.
+        """
         world = self.lights[photo].world_from_camera
-        camera_from_light = np.eye(3) if world is None else np.array(world).T
-        return camera_from_light @ YUP_FROM_CAMERA @ (np.array(sun.direction) / np.linalg.norm(sun.direction))
+        return np.eye(3) if world is None else YUP_FROM_CAMERA @ np.array(world).T @ YUP_FROM_CAMERA
 
     def photo(self, photo: str) -> Float[np.ndarray, "h w 3"]:
         """Return the photo's linear radiance."""
@@ -170,33 +177,55 @@ class SolvedSet:
         tone = self.table.model.tone.get(photo)
         return (lambda radiance: apply_tone(radiance, tone.exponent, tone.pivot)) if tone else identity_tone
 
-    def light(self, name: str) -> DistantLight:
-        """Return a photo's light in its camera's axes, or the light of a file."""
-        if is_light_file(name):
-            return read_light_map(self.inputs.file(f"recipe file:{name}"))
-        return read_photo_light(self.inputs["export"], name, self.lights[name])
+    def light(self, name: str, photo: str | None = None) -> DistantLight:
+        """Return the light of a photo or of a file.
 
-    def with_table(self, table: str | None) -> dict[str, Reflectance]:
-        """Return the solved materials, replaced and extended by those of a table file."""
-        if table is None:
-            return self.materials
-        entries = read_table(self.inputs.file(f"recipe file:{table}")).items()
+        Args:
+            name: name of the photo, or of a file in the recipe
+            photo: photo whose objects it lights.  A map stands in its world as its own exported light does, and the
+                light of a photo with a world stays fixed to that world.  By default, a map stands in the world of the
+                scene and a photo's light in its own camera's axes.
+        """
+        if is_light_file(name):
+            radiance = read_light_map(self.inputs.file(f"recipe file:{name}"))
+            return LightMap(radiance) if photo is None else LightMap(radiance, self.world_from_map(photo))
+        light = self.lights[name]
+        if photo is not None and light.world_from_camera and (here := self.lights[photo].world_from_camera):
+            light = msgspec.structs.replace(light, world_from_camera=here)
+        return read_photo_light(self.inputs["export"], name, light)
+
+    def other_lights(self, photo: str) -> list[str]:
+        """Return the first photo of every light but that of `photo`."""
+        first: dict[str, str] = {}
+        for name in self.photos:
+            first.setdefault(self.lights[name].illumination, name)
+        del first[self.lights[photo].illumination]
+        return list(first.values())
+
+    def with_table(self, table: Table) -> dict[str, Reflectance]:
+        """Return the solved materials, replaced and extended by those of a table."""
+        file = self.inputs.file(f"recipe file:{table}") if isinstance(table, str) else None
+        entries = materials_of(table, file).items()
         return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in entries}
 
     def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
-        """Return the ground given with the photo, or the plane that the neighbour rests on."""
+        """Return the ground given with the photo, or the plane that the neighbour rests or stands on."""
         ground_entry = self.grounds[photo].ground
+        if ground_entry is None and self.lights[photo].world_from_camera is not None:
+            plane, source = level_ground(neighbour, self.world_from_map(photo)[:, 1])
+            return GroundSurface(plane, source=source)
         if ground_entry is None:
             # up vectors of the cameras of all objects of the mesh, in its frame
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
             poses = [self.poses[each].objects[obj.name] for each, obj in self._objects_of(mesh)]
             trusted = [pose for pose in poses if not pose.left_out] or poses
             uprights = np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
-            return GroundSurface(ground_below(neighbour, uprights))
+            return GroundSurface(
+                ground_below(neighbour, uprights), source=f"where '{neighbour.name}' would come to rest"
+            )
         normal = YUP_FROM_CAMERA @ np.array(ground_entry.normal)
-        return GroundSurface(
-            Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(ground_entry.point)), ground_entry.diffuse
-        )
+        plane = Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(ground_entry.point))
+        return GroundSurface(plane, ground_entry.diffuse, source="that of dataset.yaml")
 
     def mesh(
         self, name: str, material: str | dict[str, str] | None, up: str

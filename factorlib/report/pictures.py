@@ -183,7 +183,7 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
     rerendered = TracedPicture(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
     others = [p for p in run.set.photos if run.illumination_of(p) in lit - {row.illumination}]
     other_light = others[0] if others else None
-    light = results.light(other_light) if other_light else rotate_light(scene.light, 180.0)
+    light = results.light(other_light, row.name) if other_light else rotate_light(scene.light, 180.0, scene.up)
     relit = TracedPicture(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
     exposure = row.errors.exposure if row.errors else 1.0
     caption = f"in the light of {other_light}" if other_light else "in its own light, turned half around"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import shlex
 import signal
@@ -25,6 +26,7 @@ DATASET_CURE = "name a folder in data/, or give the path of a folder with a data
 PIPELINE = "pipeline.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
 RESERVED = ("studies", "bench", "store", "compare", "docs")  # folders of build/ that are not datasets
+log = logging.getLogger("factorlib.runner")
 LONGEST = 200  # bytes of the name of a dataset or recipe
 SHARED = "FACTORLIB_STORE"  # environment variable: folder of a store that several checkouts share
 ALL = "all"  # stands for all recipes
@@ -191,7 +193,8 @@ class Project(msgspec.Struct, frozen=True):
     def recipes(self, data: Data, words: Sequence[str]) -> dict[str, Recipe]:
         """Read the recipes that `words` name; return them by name.
 
-        Each word is a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
+        Each word is a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.  `all` leaves out, with a
+        warning, those of recipes/, which are for every dataset, that do not suit this one.
 
         Raises:
             InputError: A recipe does not exist or is wrong, or two have one name.
@@ -212,7 +215,12 @@ class Project(msgspec.Struct, frozen=True):
             if path.stem in recipes:
                 fault = f"two recipes are called {path.stem!r}; their pictures would go to one folder"
                 raise InputError(fault, file=path, cure="rename one of them")
-            recipes[path.stem] = data.recipe(path)
+            try:
+                recipes[path.stem] = data.recipe(path)
+            except InputError as error:
+                if ALL not in words or path.parent not in roots:
+                    raise
+                log.warning("RECIPE=all leaves out %s: %s", path.stem, error)
         return recipes
 
 

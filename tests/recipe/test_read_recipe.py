@@ -7,7 +7,7 @@ import pytest
 
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.jsonfile import write_json
-from factorlib.recipe.kinds import KINDS, InsertRecipe, recipe_of
+from factorlib.recipe.kinds import KINDS, InsertRecipe, materials_of, read_table, recipe_of
 from factorlib.recipe.read_recipe import files_of, read_recipe
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.runner.project import LIBRARY
@@ -73,10 +73,24 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: view\nzoom: 2\ncamera: {photo: hall}", ["camera", "cannot be combined with zoom"]),
     ("kind: view\ncamera: {pose: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 9]]}", ["camera.pose", "not a rotation"]),
     ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
+    ("kind: view\nacross: 600\nwidth: 600", ["across", "cannot be combined with width"]),
+    ("kind: insert\nmaterial: gold\ntable: {golt: {diffuse: [0, 0, 0], specular: [0, 0, 0], roughness: 1}}", ["did you mean 'golt'"]),
+    ("kind: insert\ntable: {gold: {diffuse: [0, 0, 0], specular: [0, 0, 300], roughness: 1}}", ["gold", "0 to 1"]),
+    ("kind: insert\ntable: {gold: {diffuse: [0.5, 0, 0], specular: [0, 0.6, 0], roughness: 1}}", ["one.yaml", "table.gold", "more light"]),
 ])  # fmt: skip
 def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):
     error = refusal(".", read_recipe, written(tmp_path, text), dataset)
     assert all(word in str(error) for word in words), str(error)
+
+
+def test_photos_of_one_light_are_relit_by_maps_only(dataset, tmp_path):
+    photos = [msgspec.structs.replace(photo, illumination="room") for photo in dataset.spec.photos]
+    one = msgspec.structs.replace(dataset, spec=msgspec.structs.replace(dataset.spec, photos=photos))
+    error = refusal("share one light, 'room'", read_recipe, written(tmp_path, "kind: relight"), one)
+    assert error.key == "lights" and ".hdr" in error.cure
+    (tmp_path / "beach.hdr").write_text("")
+    path = written(tmp_path, "kind: relight\nlights: [beach.hdr]")
+    assert files_of(read_recipe(path, one), path) == {"beach.hdr": tmp_path / "beach.hdr"}
 
 
 def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tmp_path):
@@ -87,3 +101,9 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
     recipe = read_recipe(path, dataset)
     assert isinstance(recipe, InsertRecipe) and recipe.material == "gold"
     assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}
+    inside = "table: {gold: {diffuse: [0.1, 0.1, 0.1], specular: [0.5, 0.5, 0.5], roughness: 0.2}}"
+    path = written(tmp_path, f"kind: insert\nmaterial: gold\n{inside}")
+    recipe = read_recipe(path, dataset)
+    assert isinstance(recipe, InsertRecipe) and files_of(recipe, path) == {}
+    assert materials_of(recipe.table, path) == read_table(tmp_path / "own.json")
+    assert recipe_of(msgspec.to_builtins(recipe)) == recipe

@@ -12,15 +12,18 @@ from factorlib.geometry.ground import Plane, resting_plane, stable_poses
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
-from factorlib.render.ground import ground_below, on_floor
+from factorlib.render.ground import LEVEL_DEG, floor_rim, ground_below, level_ground, on_floor
 from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compare_shadow, insert_object, shadow_match
 from factorlib.render.photo_scene import (
     ALL_BOUNCES,
     CAMERA_POSE,
+    MARGIN,
+    LightMap,
     Orbit,
     PhotoScene,
     PlacedMesh,
     before_light,
+    crop_to_objects,
     light_entries,
     lit_ball,
     rotate_light,
@@ -100,7 +103,7 @@ def test_turning_camera_objects_and_light_together_changes_nothing(pair):
 
 def test_turned_lobes_and_their_turned_map_are_the_same_light(pair):
     """The map's axes are the world's, the lobes' the camera's."""
-    as_map = msgspec.structs.replace(pair, light=rotate_light(lat_long_of_lobes(pair.light, 64, 128), 70))
+    as_map = msgspec.structs.replace(pair, light=rotate_light(LightMap(lat_long_of_lobes(pair.light, 64, 128)), 70))
     as_lobes = msgspec.structs.replace(pair, light=rotate_light(pair.light, 70))
     assert differ(traced_photo(as_lobes, 256), traced_photo(as_map, 256)) < 0.02
 
@@ -110,6 +113,39 @@ def test_a_box_stands_on_its_largest_side_that_looks_down():
     plane = ground_below(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))
     assert np.allclose(plane.normal, tilted @ [0, 1, 0], atol=1e-6)
     assert (plane.point - np.array([0, 0, -5])) @ plane.normal == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize("tilt, rests", [(LEVEL_DEG - 1, True), (LEVEL_DEG + 1, False)])
+def test_in_a_world_a_thing_rests_on_its_level_side_or_stands_on_its_lowest_point_and_so_does_a_ball_beside_it(
+    pair, tilt, rests
+):
+    up = about((1, 0, 1), 25) @ UP
+    leaning = placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=about((0, 0, 1), tilt) @ about((1, 0, 1), 25))
+    plane, source = level_ground(leaning, up)
+    heights = (leaning.vertices - plane.point) @ plane.normal
+    assert heights.min() == pytest.approx(0, abs=1e-9) and ("rests" in source) is rests
+    lies_on_a_face, is_level = np.ptp(np.sort(heights)[:12]) < 1e-9, plane.normal @ up > 1 - 1e-9
+    assert [lies_on_a_face, is_level] == [rests, not rests]
+    ball = standing_mesh("ball", sphere(1.0), ("red",), UP, 0.0, spot_beside(pair, plane, leaning, 0.5, 1.0))
+    assert ((ball.vertices - plane.point) @ plane.normal).min() == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("across, finest, pixels", [(90, 1.0, 90), (None, 2.0, None), (None, 1e3, 640)])
+def test_a_crop_shows_all_objects_where_the_photo_has_them_at_the_scale_that_is_asked_for(pair, across, finest, pixels):
+    views = [Orbit(azimuth).world_from_camera(pair) for azimuth in (0, 40)]
+    cropped, (left, top, width, height) = crop_to_objects(pair, across, finest, views)
+    camera = cropped.camera
+    pixel = width / camera.width
+    assert height / camera.height == pytest.approx(pixel)
+    seen = [(pair.points - view[:3, 3]) @ view[:3, :3] for view in views]
+    whole, part = (np.concatenate([each.project(points) for points in seen]) for each in (pair.camera, camera))
+    np.testing.assert_allclose(part * pixel + [left, top], whole, atol=1e-9)
+    longer = np.ptp(part, axis=0).max()
+    assert longer == pytest.approx(pixels or finest * np.ptp(whole, axis=0).max())
+    rim = MARGIN * longer
+    assert np.allclose(part.min(axis=0), rim) and (part.max(axis=0) + rim <= [camera.width, camera.height]).all()
+    shown, _ = crop_to_objects(pair, across, finest, views, floor_rim(pair, PLANE))
+    assert shown.camera.focal == camera.focal and shown.camera.width > camera.width
 
 
 @pytest.mark.parametrize("depth", [0.0, 1e-12])
@@ -214,6 +250,8 @@ def test_about_a_tilted_normal_the_camera_keeps_its_height_and_its_distance(stud
     places = np.array([Orbit(azimuth).world_from_camera(studio, up)[:3, 3] - studio.middle for azimuth in (0, 90, 180)])
     np.testing.assert_allclose(places @ up, np.full(3, places[0] @ up), atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(places, axis=1), np.linalg.norm(studio.middle), atol=1e-9)
+    upright = msgspec.structs.replace(studio, up=up)  # of a scene whose vertical that is, too
+    np.testing.assert_allclose(Orbit(90).world_from_camera(upright)[:3, 3] - studio.middle, places[1], atol=1e-9)
 
 
 # ── Insertion against a scene that has the object in truth ──────────────────────────────────────────────────────────
@@ -295,6 +333,23 @@ def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_ob
     rows, columns = np.nonzero(result.coverage > 0)
     below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
     assert below.max() > 0.05 and difference[0].max() == 0
+
+
+def test_an_object_casts_the_shadow_of_the_sun_where_its_direction_says():
+    """A ball of radius 0.3 on the plane: its umbra is about the point of the plane that its middle hides from the sun."""
+    sun = np.array([0.8, 0.6, 0.0])
+    light = with_sun(lobes(), YUP_FROM_CAMERA @ sun, 0.53, 0.8)
+    spot = Spot(GROUND, np.array([0.3, -1.0, -6.0]), 0.6)
+    ball = standing_mesh("new", sphere(1.0), ("red",), UP, 0.0, spot)
+    aside = PlacedMesh("aside", sphere(0.2), ("grey",), rigid(np.eye(3), (-1.6, -0.8, -6)))
+    scene = PhotoScene(CAMERA, (aside,), light, MATERIALS)
+    insertion = InsertionScene(scene, GroundSurface(GROUND), ball, spot, spot, "")
+    result = insert_object(insertion, np.full((CAMERA.height, CAMERA.width, 3), 0.3), OPEN, 64)
+    dark = spot.point + 0.3 * UP - sun * 0.3 / sun[1]
+    away = np.linalg.norm(insertion.ground_points - dark, axis=-1)
+    beside = result.coverage == 0
+    assert result.shadow[beside & (away < 0.15)].max() < 0.4
+    assert result.shadow[beside & (away > 0.9) & (away < 1.5)].min() > 0.8
 
 
 def test_every_pixel_that_the_object_changes_is_within_its_reach_and_all_others_are_the_photo():

@@ -29,6 +29,8 @@ OVER_RECIPES = '  shout: {inputs: [upper], over: recipe, optional: true, makes: 
 
 def reading(path: Path) -> Recipe:
     output = json.loads(path.read_text())
+    if "fault" in output:
+        raise InputError(output["fault"], file=path)
     return Recipe(output, {output["file"]: path.parent / output["file"]} if output.get("file") else {})
 
 
@@ -115,6 +117,18 @@ def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_those_of_
     LOOKED_AT.clear()
     write(more, "another fault")
     assert make(project, "all") == 1 and LOOKED_AT == ["more.txt"]
+
+
+def test_all_leaves_out_a_recipe_for_every_set_that_does_not_suit_this_one_and_one_of_the_sets_own_is_refused(
+    project, caplog
+):
+    data = project.provider.read(project.root / "data" / "set")
+    write(project.root / "recipes" / "odd.yaml", '{"fault": "one light"}')
+    assert list(project.recipes(data, ["all"])) == ["hello", "bye"] and "leaves out odd" in caplog.text
+    for words in (["odd"], ["all"]):
+        with pytest.raises(InputError, match="one light"):
+            project.recipes(data, words)
+        write(project.root / "recipes" / "set" / "odd.yaml", '{"fault": "one light"}')
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,13 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
+from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.meshes.read_mesh import read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.recipe import kinds
 from factorlib.render.insertion import ShadowMatch
+from factorlib.render.photo_scene import UP, LightMap, rotate_light, traced_photo
+from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, attach_errors
 from factorlib.results.texture_table import FACTORS, FILE, TextureTable, write_factors
@@ -25,6 +28,7 @@ from tests.refusal import refusal
 from tests.runner.toy import files_of
 
 ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
+WORLD = made_export.WORLD_FROM_CAMERA["side"]
 
 
 @pytest.fixture
@@ -57,10 +61,10 @@ ANIMATED = ["front.gif", "front.mp4"] if find_spec("av") else ["front.gif"]
 KINDS = [
     (kinds.ResynthesisRecipe(samples=1), PICTURES["front"] + PICTURES["side"]),
     (kinds.ViewRecipe(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
-    (kinds.ViewRecipe(photos=["side"], samples=1, azimuth=180, floor=0.5), PICTURES["side"]),
+    (kinds.ViewRecipe(photos=["side"], samples=1, azimuth=180, floor=0.5), [*PICTURES["side"], "side.json"]),
     (kinds.TurntableRecipe(**FRONT, frames=3), [*ANIMATED, *(f"front/00{k}.png" for k in range(3))]),
     (kinds.MovingLightRecipe(**FRONT, frames=2, width=16), [*ANIMATED, "front/000.png", "front/001.png"]),
-    (kinds.RelightRecipe(samples=1, rotate=30.0, photos=["side"]), [f"side/{name}" for name in PICTURES["front"]]),
+    (kinds.RelightRecipe(samples=1, rotate=30.0, photos=["side"]), ["side.json", *(f"side/{name}" for name in PICTURES["front"])]),
     (kinds.TransferRecipe(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
     (kinds.InsertRecipe(**FRONT), [*PICTURES["front"], "front.json"]),
     (kinds.InsertRecipe(**FRONT, mesh="egg", material="brass", at=(40.0, 50.0)), [*PICTURES["front"], "front.json"]),
@@ -190,6 +194,48 @@ def test_the_light_of_a_file_is_used_as_it_lies(inputs, tmp_path):
     picture = read_exr(tmp_path / "out" / "front" / "lamp.exr")
     left, right = np.array_split(np.nonzero(picture["A"].max(axis=0))[0], 2)
     assert picture["R"][:, right].sum() > 3 * picture["R"][:, left].sum()
+
+
+def test_a_map_of_a_file_relights_as_the_same_map_as_the_light_of_the_set_does(inputs, tmp_path):
+    """Of a photo with a tilted world: the map of its light, in the frame of the exported ones, stands where the light does."""
+    lobes = made_export.light(1)  # in the camera's frame
+    write_rgb_exr(tmp_path / "room.exr", lat_long_of_lobes(lobes.rotate(WORLD), 64, 128))
+    results = SolvedSet(
+        Inputs(inputs.folders, inputs.facts, {**inputs.files, "recipe file:room.exr": tmp_path / "room.exr"})
+    )
+    scene = results.scene("side")
+    named = results.light("room.exr", "side")
+    for turn in (0.0, 70.0):
+        own, mapped, wrong = (
+            traced_photo(msgspec.structs.replace(scene, light=rotate_light(light, turn, up)), 64)
+            for light, up in ((lobes, scene.up), (named, scene.up), (LightMap(named.radiance), UP))
+        )
+        errors = [np.abs(other - own).mean() / own.mean() for other in (mapped, wrong)]
+        assert errors[0] < 0.01 < 0.1 < errors[1], errors
+    assert scene.up == pytest.approx(YUP_FROM_CAMERA @ WORLD.T @ [0, -1, 0])
+
+
+def test_the_light_of_a_photo_stays_fixed_to_the_world_that_two_photos_share_and_comes_once(inputs):
+    worlds = {name: {"illumination": "room", "world_from_camera": WORLD.T.tolist()} for name in ("front", "third")}
+    some = changed(inputs, "dataset.light", {**inputs.facts["dataset.light"], "front": worlds["front"]})
+    results = SolvedSet(some)
+    front, side = (results.light("side", photo) for photo in ("front", "side"))
+    np.testing.assert_allclose(front.rotate(WORLD.T).axis, side.rotate(WORLD).axis, atol=1e-12)
+    assert results.other_lights("front") == [] and SolvedSet(inputs).other_lights("front") == ["side"]
+
+
+def test_a_ground_that_the_recipe_lowers_lies_so_many_heights_lower_and_the_caption_says_so(grounded, tmp_path):
+    results = SolvedSet(grounded)
+    plain, low = (
+        insertion_scene(kinds.InsertRecipe(photos=["front"], ground=kinds.GroundFields(drop=drop)), results, "front")
+        for drop in (0.0, 0.25)
+    )
+    normal = plain.ground.plane.normal
+    height = np.ptp(plain.scene.objects[0].vertices @ normal)
+    assert (plain.ground.plane.point - low.ground.plane.point) @ normal == pytest.approx(0.25 * height)
+    assert (low.new.vertices @ normal).min() == pytest.approx(low.ground.plane.point @ normal)
+    assert low.spot.height == pytest.approx(plain.spot.height)
+    assert low.ground.source == "that of dataset.yaml, lowered by 0.25 of its heights as the recipe says"
 
 
 def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(inputs, tmp_path, caplog):
