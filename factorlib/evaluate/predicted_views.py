@@ -69,12 +69,15 @@ def compare_view(photo: PosedPhoto, sources: Iterable[PosedPhoto]) -> dict[str, 
 
 def describe_views(views: Mapping[str, Mapping[str, float]]) -> str:
     """Describe the scores of held-out photos, means over them, beside those of pictures that need no result."""
-    photos = f"photo '{next(iter(views))}'" if len(views) == 1 else f"{len(views)} photos"
+    one = len(views) == 1
+    photos = (
+        f"photo '{next(iter(views))}', which the solve had not seen, is" if one else f"{len(views)} held-out photos are"
+    )
     pictures = ("predicted", "nearest_photo", "flat")
     predicted, nearest, flat = (float(np.mean([scores[p] for scores in views.values()])) for p in pictures)
     outcome = "better than both" if predicted > max(nearest, flat) else "NOT better than both"
     return (
-        f"{photos}, which the solve had not seen, predicted to {predicted:.1f} dB; the nearest photo laid over the mesh"
+        f"{photos} predicted to {predicted:.1f} dB; the nearest photo laid over the mesh"
         f" reaches {nearest:.1f} dB, and flat colours {flat:.1f} dB: the prediction is {outcome}"
     )
 
