@@ -80,7 +80,7 @@ help-all:
 	@echo 'make all DATASET=eames               run the whole pipeline; DATASET is a name in data/ or a path to a folder'
 	@echo 'make <stage> DATASET=…               run one stage and the stages that it needs: $(STAGES)'
 	@echo '     SET="solve.cells=800 …"         with other parameters      FORCE=1   run again, even if up to date'
-	@echo '     HELD_OUT=0066,0069               photos that this run predicts and does not solve from (docs/runner.md)'
+	@echo '     HELD_OUT=0066,0069               photos that this run predicts and does not solve from, or none (docs/evaluate.md)'
 	@echo '     STRICT=1                         exit code 3 (2 of make) where the verdict is "do not trust" (docs/verdict.md)'
 	@echo '     FACTORLIB_STORE=<folder>         share results with other checkouts (docs/runner.md)'
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'

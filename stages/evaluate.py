@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from factorlib.dataset.schema import LightSlice, TruthFile, solved_photos
+from factorlib.dataset.schema import LightSlice, TruthFile, solved_photos, with_all_rejoined
 from factorlib.evaluate.ball import OctahedralLight, octahedral_light
 from factorlib.evaluate.comparison_gauge import material_components
 from factorlib.evaluate.picture_errors import ComparedPhoto, combine_photo, compare_photos
@@ -36,11 +36,13 @@ from factorlib.evaluate.truth import (
 from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
+from factorlib.render.resynthesis import paint_shading
 from factorlib.results.exchange import with_exchange
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
 from factorlib.results.metrics import AlbedoErrors, Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
+from factorlib.results.surface_table import read_surface
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels, read_geometry
 from factorlib.wholefile import write_text
@@ -64,26 +66,33 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare results with the photos and the truth, and write metrics.json."""
-    inputs = with_exchange(inputs)
-    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    first = inputs
+    inputs = with_exchange(first)
+    slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    lights = with_all_rejoined(slices) if inputs["solve"] != first["solve"] else slices
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
     materials = inputs.facts["dataset.materials"]
     counter = count()
-    total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
+    held_out = [name for name, light in slices.items() if light.held_out]
+    total = 2 * len(solved_photos(lights)) + 3 * len(held_out) + (len(MISSING) if truth else 0) + 1
 
     def read_photo(name: str) -> ComparedPhoto:
         """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
         progress(next(counter), total, f"re-synthesis of {name}")
         return _read_photo(inputs, name)
 
-    solved = solved_photos(lights)
-    held_out = [name for name in lights if name not in solved]
-    resynthesis = compare_photos(solved, materials, read_photo)
+    def read_prediction(name: str) -> ComparedPhoto:
+        """Return a held-out photo and its prediction, by the solve that did not use it."""
+        progress(next(counter), total, f"prediction of {name}")
+        return _read_photo(first, name, predicted=True) if slices[name].rejoins else _read_photo(inputs, name)
+
+    resynthesis = compare_photos(solved_photos(lights), materials, read_photo)
     # connected components of the graph of materials and lights
     observed = _observed_materials(resynthesis, lights)
     component = material_components({light: names for light, names in observed.items() if names})
-    sections = dict.fromkeys(MISSING) | {"views": _views(inputs, held_out, solved)}
-    sections["held_out"] = compare_photos(held_out, materials, read_photo) if held_out else None
+    predictions = {name: read_prediction(name) for name in held_out}
+    sections = dict.fromkeys(MISSING) | {"views": _views(first, predictions, solved_photos(slices))}
+    sections["held_out"] = compare_photos(held_out, materials, read_prediction) if held_out else None
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
         estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the exported lights' gauge
@@ -107,28 +116,35 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     reasons |= {} if sections["verdict"] else {"verdict": NO_MATERIAL}
     write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     if sections["verdict"]:
-        write_text(out / "verdict.txt", verdict_text(sections["verdict"]))
+        write_text(out / "verdict.txt", verdict_text(sections["verdict"], sections["views"]))
     progress(total, total)
 
 
-def _read_photo(inputs: Inputs, name: str) -> ComparedPhoto:
-    """Return a photo and its re-synthesis."""
+def _read_photo(inputs: Inputs, name: str, predicted: bool = False) -> ComparedPhoto:
+    """Return a photo and its re-synthesis; if `predicted`, that of the first solve, which `render` did not draw."""
     photo = read_exr(inputs["masks"] / f"{name}.exr")
     geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name, inputs.folders.get("texture"))
+    if predicted:
+        model = read_materials(inputs["solve"] / "materials.json").model
+        return combine_photo(photo, geometry, paint_shading(inputs["shading"], name, geometry, model))
     return combine_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
 
-def _views(inputs: Inputs, held_out: list[str], solved: list[str]) -> dict[str, dict[str, float]] | None:
+def _views(
+    inputs: Inputs, predictions: dict[str, ComparedPhoto], solved: list[str]
+) -> dict[str, dict[str, float]] | None:
     """Return the scores of predicted views, by held-out photo; None without any."""
     poses = read_poses(inputs["align"] / "poses.json")
 
-    def read(name: str) -> PosedPhoto:
+    def posed(name: str, photo: ComparedPhoto) -> PosedPhoto:
         """Return a photo with its camera, poses and the maps of `align`."""
-        photo = _read_photo(inputs, name)
         camera = poses[name].camera.camera(*photo.label.shape[::-1])
         return PosedPhoto(photo, read_geometry(inputs["align"], None, name), camera, poses[name].objects)
 
-    views = {name: compare_view(read(name), map(read, solved)) for name in held_out}
+    views = {
+        name: compare_view(posed(name, photo), (posed(source, _read_photo(inputs, source)) for source in solved))
+        for name, photo in predictions.items()
+    }
     return {name: scores for name, scores in views.items() if scores} or None
 
 
@@ -155,13 +171,18 @@ def _verdict(inputs: Inputs, observed: dict[str, list[str]]) -> Verdict | None:
     lights = {name: octahedral_light(read_rgb_exr(files / f"{name}.exr")) for name, names in observed.items() if names}
     if not (materials and uncertainty.photos):
         return None
-    contours = {
-        photo: {name: obj.contour_error for name, obj in entry.objects.items() if obj.contour_error is not None}
-        for photo, entry in read_poses(inputs["align"] / "poses.json").items()
-    }
+    poses = read_poses(inputs["align"] / "poses.json")
+    contours, overlaps = (
+        {
+            photo: {n: value for n, obj in entry.objects.items() if (value := getattr(obj, measure)) is not None}
+            for photo, entry in poses.items()
+        }
+        for measure in ("contour_error", "silhouette_iou")
+    )
     errors = ball_changes(materials, lights)
     misfit = (uncertainty.unexplained, uncertainty.photos)
-    return verdict(VerdictInputs(errors, *misfit, contours, uncertainty.residual_sigma))
+    surface = read_surface(inputs.folders.get("surface")).disagreement
+    return verdict(VerdictInputs(errors, *misfit, contours, uncertainty.residual_sigma, overlaps, surface))
 
 
 def _lights(

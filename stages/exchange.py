@@ -1,12 +1,16 @@
-"""Exchange of paint and light: the solve and the textures once more, each with what the other found.
+"""Second pass: the solve once more, with the paint that was found and with the photo that was predicted first.
 
 `texture` estimates paint in lights that were estimated without it, so lights and specular parts explain some of the
 paint.  Where a texture is kept, the solve continues with the textures as detail of the surface and with its choices of
 the model.  The photos are shaded in these lights, and the kept textures are estimated again, no softer.  The exchange
 is kept if the textures then predict photos better that they were not estimated from.
 
-Writes exchange.json.  If the exchange is kept, the folders `solve`, `shading` and `texture` are new results of these
-stages, which replace theirs (`factorlib.results.exchange`).
+A photo that only the first solve left out (`LightSlice.rejoins`) takes part in this one, which continues the first
+with its choices of the model.  Textures and surface detail stay those of the other photos: they were decided on these.
+If no texture is kept, or the exchange is not, the solve continues without paint.
+
+Writes exchange.json.  If the solve continued, the folders `solve`, `shading` and, with paint, `texture` are new results
+of these stages, which replace theirs (`factorlib.results.exchange`).
 """
 
 import logging
@@ -23,7 +27,7 @@ import msgspec
 import stages.shading
 import stages.solve
 import stages.texture
-from factorlib.dataset.schema import LightSlice
+from factorlib.dataset.schema import LightSlice, with_all_rejoined
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.exchange import FILE, REPLACED, Exchange
@@ -50,21 +54,26 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Solve, shade and paint again where a texture is kept, and keep the result if it predicts better."""
+    """Solve, shade and paint again where a texture is kept or a photo rejoins; keep paint if it predicts better."""
     before = read_table(inputs["texture"])
-    if not before.longest or params.solve.solver == "paper":  # the paper's materials are uniform
-        write_json(out / FILE, Exchange(False))
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    decision = Exchange(False)
+    if params.solve.solver == "paper":  # its materials are uniform, and it continues no solution
+        write_json(out / FILE, decision)
         return
-    with held_back() as warnings:
-        solve_again(params, inputs, out, progress, before)
-    losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
-    kept = losses[1] < losses[0]
-    for warning in warnings if kept else ():
-        LIBRARY.handle(warning)
-    if not kept:
-        for name in REPLACED:
-            shutil.rmtree(out / name)
-    write_json(out / FILE, Exchange(kept, *losses))
+    if before.longest:
+        with held_back() as warnings:
+            solve_again(params, inputs, out, progress, before)
+        losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
+        decision = Exchange(losses[1] < losses[0], *losses)
+        for warning in warnings if decision.kept else ():
+            LIBRARY.handle(warning)
+        if not decision.kept:
+            for name in REPLACED:
+                shutil.rmtree(out / name)
+    if not decision.kept and any(light.rejoins for light in lights.values()):
+        solve_again(params, inputs, out, progress)
+    write_json(out / FILE, decision)
 
 
 @contextmanager
@@ -79,18 +88,29 @@ def held_back() -> Iterator[list[logging.LogRecord]]:
         LIBRARY.handlers, LIBRARY.propagate = handlers, propagate
 
 
-def solve_again(params: Params, inputs: Inputs, out: Path, progress: Progress, before: TextureTable) -> None:
-    """Solve with the textures as detail of the surface, shade in the new lights, and estimate the textures again.
+def solve_again(
+    params: Params, inputs: Inputs, out: Path, progress: Progress, before: TextureTable | None = None
+) -> None:
+    """Solve all photos with the textures as detail of the surface, shade in the new lights, and paint again.
 
     The choices of the solve stay, and the kept textures become no softer.
+
+    Args:
+        params: Parameters of the stages.
+        inputs: Inputs of the stage.
+        out: Folder to write to.
+        progress: Called with the completed work, its total and the current activity.
+        before: Textures; None to solve and shade without paint.
     """
-    for name in REPLACED:
+    for name in REPLACED if before else REPLACED[:-1]:
         (out / name).mkdir()
-    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    lights = with_all_rejoined(msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice]))
     first, second = SHARES
     with TemporaryDirectory() as folder:
-        painted = paint_surface(inputs, Path(folder), list(lights))
-        continued = with_folders(inputs, surface=painted, start=inputs["solve"])
+        painted = {"surface": paint_surface(inputs, Path(folder), list(lights))} if before else {}
+        continued = with_folders(inputs, start=inputs["solve"], **painted)
+        facts = {**inputs.facts, "dataset.light": msgspec.to_builtins(lights)}
+        continued = msgspec.structs.replace(continued, facts=facts)
         stages.solve.main(params.solve, continued, out / "solve", part_of(progress, 0, first), decided=True)
     solved = with_folders(inputs, solve=out / "solve")
 
@@ -102,8 +122,9 @@ def solve_again(params: Params, inputs: Inputs, out: Path, progress: Progress, b
         progress(first, 1, f"{name}: shading")
 
     inputs.map(shade, list(lights))
-    shaded = with_folders(solved, shading=out / "shading")
-    stages.texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1), before)
+    if before:
+        shaded = with_folders(solved, shading=out / "shading")
+        stages.texture.main(params.texture, shaded, out / "texture", part_of(progress, second, 1), before)
 
 
 def paint_surface(inputs: Inputs, folder: Path, photos: list[str]) -> Path:

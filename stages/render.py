@@ -16,9 +16,8 @@ from factorlib.dataset.schema import LightSlice
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
-from factorlib.images.tone import apply_tone
 from factorlib.reflection import reflection_operator
-from factorlib.render.resynthesis import Reflector, observed_cells, read_shading, render_balls
+from factorlib.render.resynthesis import Reflector, observed_cells, paint_shading, render_balls
 from factorlib.results.exchange import with_exchange
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import read_materials, select_materials
@@ -56,12 +55,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     reflector = Reflector(operator, light, model.curvature(slice_.illumination))
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
     materials = select_materials(exported, names, file)
-    radiance, specular = read_shading(inputs["shading"], name)
-    if "detail.R" in geometry:
-        radiance = radiance * np.stack([geometry[f"detail.{channel}"] for channel in "RGB"], axis=-1)
-    radiance = radiance + specular
-    if tone := model.tone.get(name):
-        radiance = apply_tone(radiance, tone.exponent, tone.pivot)
+    radiance = paint_shading(inputs["shading"], name, geometry, model)
     _write(out / "resynthesis" / name, radiance, exposure, ball=False)
     # balls and reflectance maps, material by material
     observed = observed_pixels(photo, geometry)

@@ -15,8 +15,9 @@ import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, solved_photos
+from factorlib.errors import InputError
 from factorlib.images.exr import write_exr
-from factorlib.inference.aligned_photo import read_aligned_photos, visible_meshes
+from factorlib.inference.aligned_photo import AlignedPhoto, read_aligned_photos, visible_meshes
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, read_backgrounds, usable_observations
 from factorlib.inference.problem import JointProblem
@@ -69,6 +70,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     fitted = sorted(solved_photos(lights))
     observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in fitted}
+    refuse_left_out({name: photos[name] for name in fitted}, observations)
     attached = {
         name: photos[name].attach(np.column_stack([pixels.x, pixels.y]), surfaces)
         for name, pixels in observations.items()
@@ -99,6 +101,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
     progress(1, 1)
+
+
+def refuse_left_out(photos: dict[str, AlignedPhoto], observations: dict[str, Observations]) -> None:
+    """Raise InputError if no photo has an observation and doubtful poses were left out; it names these."""
+    left_out = [f"'{each}' in '{name}'" for name, photo in photos.items() for each in photo.poses.left_out]
+    if left_out and not any(map(len, observations.values())):
+        raise InputError(
+            "no valid observation in any photo, for doubtful poses are left out: " + ", ".join(left_out),
+            cure='look at their overlays in `align`; where they are right, SET="align.keep_doubtful=true" lets them in',
+        )
 
 
 def draw_observations(file: Path, params: Params) -> Observations:

@@ -8,6 +8,7 @@ import logging
 import mmap
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,7 +18,7 @@ import msgspec
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.gltf_header import buffer_path, read_header
 from factorlib.dataset.paths import Refusal, file_exists, path_on_disk
-from factorlib.dataset.schema import Dataset, DatasetFile, ExternalCamera, TruthFile
+from factorlib.dataset.schema import Dataset, DatasetFile, ExternalCamera, MirrorBall, PhotoEntry, TruthFile
 from factorlib.errors import InputError, raise_all
 from factorlib.reading import check_plain, path_inside, read_text, reading
 from factorlib.yamlfile import MOST_BYTES, convert, parse_yaml, read_yaml
@@ -31,6 +32,9 @@ OPEN = "left_open"  # placeholder for `?` in a draft
 PATHS = re.compile(  # keys of paths
     r".*\.(image|mask|file|colmap|transforms|bop)|.*\.masks(\.[^.]+)?|truth|known\.illumination\.[^.]+"
 )
+NO_PHOTO = "none"  # word of HELD_OUT for no photo
+# Least number of photos that share a light from which one is left out of the first solve, which loses little by that.
+FEWEST_WITH_TEST = 8
 MOST_NAMED = 20  # open places or photos that an error lists
 
 
@@ -55,6 +59,7 @@ def read_dataset(path: str | Path) -> Dataset:
     raise_all(faults)
     external: dict[str, ExternalCamera] = {}
     refuse = Refusal(file, file.parent)
+    up = origin_of_up(spec)
     companions = {
         name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items() if mesh.file
     }
@@ -63,15 +68,18 @@ def read_dataset(path: str | Path) -> Dataset:
 
         spec, external = external_cameras(spec, file)
     check_lights(spec.photos, file)
-    return Dataset(folder=folder, spec=spec, companions=companions, external=external, truth=_read_truth(spec, file))
+    truth = _read_truth(spec, file)
+    return Dataset(folder=folder, spec=spec, companions=companions, external=external, truth=truth, up=up)
 
 
 def hold_out(dataset: Dataset, names: Sequence[str]) -> Dataset:
     """Return the dataset with further photos held out, as if dataset.yaml said `held_out: true` for each.
 
+    If neither names any, the photo of `choose_test_photo` is predicted first and then solved with the others.
+
     Args:
         dataset: the dataset
-        names: names of photos; one text may hold several, separated by commas or blanks
+        names: names of photos; one text may hold several, separated by commas or blanks; `none` for no photo
 
     Raises:
         InputError: A photo does not exist, or every photo would be held out.
@@ -79,14 +87,46 @@ def hold_out(dataset: Dataset, names: Sequence[str]) -> Dataset:
     chosen = " ".join(names).replace(",", " ").split()
     photos = [msgspec.structs.replace(p, held_out=p.held_out or p.name in chosen) for p in dataset.spec.photos]
     known = [photo.name for photo in photos]
+    if not chosen and not any(photo.held_out for photo in photos):
+        return msgspec.structs.replace(dataset, test_photo=choose_test_photo(dataset.spec))
+    if chosen == [NO_PHOTO] and NO_PHOTO not in known:
+        return dataset
     unknown = [f"there is no photo {name!r}" for name in chosen if name not in known]
     if unknown or all(photo.held_out for photo in photos):
         raise InputError(
             unknown[0] if unknown else "every photo is held out, so that none is left to solve from",
             key="HELD_OUT",
-            cure=f"name some of the dataset's photos, but not all, separated by commas; they are {_enumerate(known)}",
+            cure=f"name some of the dataset's photos, but not all, separated by commas, or {NO_PHOTO}; "
+            f"they are {_enumerate(known)}",
         )
     return msgspec.structs.replace(dataset, spec=msgspec.structs.replace(dataset.spec, photos=photos))
+
+
+def choose_test_photo(spec: DatasetFile) -> str | None:
+    """Return the photo that the first solve leaves out and predicts; None if too few photos share a light.
+
+    It is the middle one of the light that most photos share, in the order of dataset.yaml: its neighbours on both sides
+    see its surfaces.  Another photo in this light shows each of its objects, and none of these is a mirror ball.
+    """
+    by_light: dict[str, list[PhotoEntry]] = {}
+    for photo in spec.photos:
+        by_light.setdefault(photo.light, []).append(photo)
+    group = max(by_light.values(), key=len)
+    balls = {light.chrome for light in spec.known.illumination.values() if isinstance(light, MirrorBall)}
+    shown = Counter(obj.name for photo in group for obj in photo.objects if obj.name not in balls)
+    eligible = [p.name for p in group if p.objects and all(shown[obj.name] > 1 for obj in p.objects)]
+    return eligible[len(eligible) // 2] if eligible and len(group) >= FEWEST_WITH_TEST else None
+
+
+def origin_of_up(spec: DatasetFile) -> str:
+    """Describe how up is known, from a dataset as it is written: by whom worlds of lights are turned upright."""
+    if any(photo.world_from_camera for photo in spec.photos):
+        return "dataset.yaml gives the world (`world_from_camera`), whose −y is taken to point up"
+    if spec.cameras is not None and spec.cameras.world_from_camera:
+        if spec.cameras.up:
+            return f"`cameras.up: {spec.cameras.up}` in dataset.yaml says so"
+        return "it is the cameras' common horizon, as of photos that are held level; `cameras.up` sets another"
+    return "each light is fixed to its camera, and up is the upper edge of the photo, as if it was held level"
 
 
 def _enumerate(names: Sequence[str]) -> str:

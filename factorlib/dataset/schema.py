@@ -301,6 +301,8 @@ class Dataset(msgspec.Struct, frozen=True, dict=True):
     Attributes:
         companions: files that a mesh's file refers to (.mtl, glTF buffers), relative to the folder, by mesh
         external: camera from the source of cameras, by photo
+        test_photo: photo that only the first solve leaves out, to be predicted; None without one
+        up: how the direction that points up is known, in words
     """
 
     folder: Path
@@ -308,6 +310,8 @@ class Dataset(msgspec.Struct, frozen=True, dict=True):
     companions: dict[str, list[str]] = {}
     external: dict[str, ExternalCamera] = {}
     truth: TruthFile | None = None
+    test_photo: str | None = None
+    up: str = ""
 
     @property
     def name(self) -> str:
@@ -371,17 +375,27 @@ class LightSlice(msgspec.Struct, frozen=True, omit_defaults=True):
     """The illumination of a photo, and the rotation that fixes it to the world (None: fixed to the camera).
 
     Attributes:
-        held_out: True for a photo that the results predict, and do not come from
+        held_out: True for a photo that is predicted, and not solved from
+        rejoins: True for a held-out photo that the solve of `exchange` uses, once the first solve has predicted it
     """
 
     illumination: str
     world_from_camera: Mat3 | None
     held_out: bool = False
+    rejoins: bool = False
 
 
 def solved_photos(lights: Mapping[str, LightSlice]) -> list[str]:
     """Return the names of the photos that are not held out, in order."""
     return [name for name, light in lights.items() if not light.held_out]
+
+
+def with_all_rejoined(lights: Mapping[str, LightSlice]) -> dict[str, LightSlice]:
+    """Return the illuminations of a solve in which the photos that rejoin take part."""
+    return {
+        name: msgspec.structs.replace(light, held_out=light.held_out and not light.rejoins)
+        for name, light in lights.items()
+    }
 
 
 class GroundSlice(msgspec.Struct, frozen=True):
@@ -407,9 +421,14 @@ class KnownSlice(msgspec.Struct, frozen=True):
 
 
 class SetSlice(msgspec.Struct, frozen=True):
-    """Names, materials, meshes and photos of the set, in the order of dataset.yaml."""
+    """Names, materials, meshes and photos of the set, in the order of dataset.yaml.
+
+    Attributes:
+        up: how the direction that points up is known, in words
+    """
 
     name: str
     materials: list[str]
     meshes: dict[str, MeshEntry]
     photos: list[str]
+    up: str = ""

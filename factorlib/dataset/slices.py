@@ -89,6 +89,11 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
     return facts, files + _object_masks(photo)
 
 
+def _light(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.LightSlice, list[str]]:
+    rejoins = photo.name == dataset.test_photo
+    return schema.LightSlice(photo.light, photo.world_from_camera, photo.held_out or rejoins, rejoins), []
+
+
 def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
     known = dataset.spec.known
     balls = {}
@@ -136,14 +141,18 @@ def _fields(value: Any, name: str) -> dict[str, Any]:
 _PHOTO_SLICES: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
     "photo": _photo,
     "objects": _objects,
-    "light": lambda dataset, photo: (schema.LightSlice(photo.light, photo.world_from_camera, photo.held_out), []),
+    "light": _light,
     "ground": lambda dataset, photo: (schema.GroundSlice(photo.ground), []),
 }
 _SET_SLICES: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
     "materials": lambda dataset: (dataset.spec.materials, []),
     "set": lambda dataset: (
         schema.SetSlice(
-            dataset.name, dataset.spec.materials, dataset.spec.meshes, [photo.name for photo in dataset.spec.photos]
+            dataset.name,
+            dataset.spec.materials,
+            dataset.spec.meshes,
+            [photo.name for photo in dataset.spec.photos],
+            dataset.up,
         ),
         [],
     ),

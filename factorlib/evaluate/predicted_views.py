@@ -14,7 +14,7 @@ A photo sees a point if the surface faces its camera, its depth map has the poin
 count and have the point's material.  Objects of one name are the same object.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import msgspec
 import numpy as np
@@ -65,6 +65,21 @@ def compare_view(photo: PosedPhoto, sources: Iterable[PosedPhoto]) -> dict[str, 
     }
     scores = {name: displayed_psnr(view, truth) for name, view in views.items()}
     return scores | {"visible": round(float(visible.mean()), 6)}
+
+
+def describe_views(views: Mapping[str, Mapping[str, float]]) -> str:
+    """Describe the scores of held-out photos, means over them, beside those of pictures that need no result."""
+    one = len(views) == 1
+    photos = (
+        f"photo '{next(iter(views))}', which the solve had not seen, is" if one else f"{len(views)} held-out photos are"
+    )
+    pictures = ("predicted", "nearest_photo", "flat")
+    predicted, nearest, flat = (float(np.mean([scores[p] for scores in views.values()])) for p in pictures)
+    outcome = "better than both" if predicted > max(nearest, flat) else "NOT better than both"
+    return (
+        f"{photos} predicted to {predicted:.1f} dB; the nearest photo laid over the mesh"
+        f" reaches {nearest:.1f} dB, and flat colours {flat:.1f} dB: the prediction is {outcome}"
+    )
 
 
 def warp_photos(

@@ -24,6 +24,7 @@ import numpy as np
 
 from factorlib.evaluate.ball import OctahedralLight
 from factorlib.evaluate.picture_errors import tone_map
+from factorlib.evaluate.predicted_views import describe_views
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
 from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, SolvedMaterial
@@ -39,6 +40,9 @@ DEVIATION = 4.0  # deviation of the scores from the expected one, dB
 GOOD = 24.0  # least expected score of a good result, dB
 POOR = 19.0  # least expected score of a usable result, dB
 DISAGREES = 3.0  # residuals above which shapes and photos disagree, in units of their noise
+# Residuals of photos that had no part in the surface above which photos disagree about it, in units of their noise.
+SURFACE_DISAGREES = 2.0
+FITTING = 0.95  # silhouette overlap (IoU) above which an overlay shows no fault
 MUCH = 0.1  # unexplained share from which an input is wrong and not only inaccurate
 LEAST_SHARE = 0.2  # least share of e² for a term to be a reason
 
@@ -82,6 +86,8 @@ class VerdictInputs(msgspec.Struct, frozen=True):
         photos: unexplained share and clipped share of each photo
         contours: d, contour error of each object with a compared outline, by photo and object
         deviation: deviation of the residuals in units of their noise, which scales the standard errors of materials
+        overlaps: silhouette overlap (IoU) of each object, by photo and object
+        surface: residual of photos that had no part in the surface, in units of their noise; None if it is not known
     """
 
     materials: dict[str, float]
@@ -89,6 +95,8 @@ class VerdictInputs(msgspec.Struct, frozen=True):
     photos: dict[str, Misfit]
     contours: dict[str, dict[str, float]]
     deviation: float = 1.0
+    overlaps: dict[str, dict[str, float]] = {}
+    surface: float | None = None
 
     def terms(self) -> dict[str, float]:
         """Return the four measured terms of (1) by name, all but FLOOR."""
@@ -110,17 +118,25 @@ def verdict(inputs: VerdictInputs) -> Verdict:
     ranked = sorted(terms, key=terms.__getitem__, reverse=True)
     limiting = [name for name in ranked if terms[name] >= LEAST_SHARE * whole] or ranked[:1]
     explained = [EXPLANATIONS[name](inputs) for name in limiting]
+    reasons = [why for why, _ in explained]
+    if inputs.surface is not None and inputs.surface > SURFACE_DISAGREES:
+        reasons.append(
+            f"photos that disagree about the surface: it misses those that had no part in it by {inputs.surface:.1f} "
+            "times their noise"
+        )
     rounded = {name: float(f"{term:.6g}") for name, term in terms.items()}
-    return Verdict(trust, expected, DEVIATION, [why for why, _ in explained], explained[0][1], rounded)
+    return Verdict(trust, expected, DEVIATION, reasons, explained[0][1], rounded)
 
 
-def verdict_text(verdict: Verdict) -> str:
-    """Format the verdict for a terminal, conclusion first."""
+def verdict_text(verdict: Verdict, views: Mapping[str, Mapping[str, float]] | None = None) -> str:
+    """Format the verdict for a terminal, conclusion first, with the scores of held-out photos (`predicted_views`)."""
     head = (
         f"{verdict.trust}: relit pictures are expected to reach "
         f"{verdict.expected_relit_db:.0f} ± {verdict.deviation_db:.0f} dB"
     )
-    return "\n".join([head, *(f"limited by: {why}" for why in verdict.reasons), f"next: {verdict.next}", ""])
+    measured = [f"measured: {describe_views(views)}"] if views else []
+    reasons = [f"limited by: {why}" for why in verdict.reasons]
+    return "\n".join([head, *measured, *reasons, f"next: {verdict.next}", ""])
 
 
 def _percent(share: float) -> str:
@@ -163,10 +179,16 @@ def _explain_unexplained(inputs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if unexplained shading limits the score."""
     name = max(inputs.photos, key=lambda photo: inputs.photos[photo].unexplained)
     share = min(inputs.photos[name].unexplained, 1)
+    overlap = min(inputs.overlaps.get(name, {}).values(), default=0.0)
     next_ = "a mesh that is nearer to the objects"
-    if share >= MUCH:
+    if share >= MUCH and overlap < FITTING:
         wrong = "its mesh, pose, masks or the names of its materials are wrong, or a program has changed the picture"
         next_ = f"look at the overlay of '{name}' in the report: {wrong}"
+    elif share >= MUCH and (inputs.surface or 0.0) > SURFACE_DISAGREES:
+        next_ += " inside their outlines, which fit: a scan, or for a hull photos from more sides, above and below"
+    elif share >= MUCH:
+        wrong = "a material has several colours or finishes, or a program has changed the picture"
+        next_ = f"look at the difference picture of '{name}' in the report, for its outlines fit: {wrong}"
     return f"shading that stays unexplained, in '{name}' {_percent(share)} of it", next_
 
 

@@ -96,7 +96,9 @@ def blocks_of_observations(
     usable = usable_observations(observations)
     if len(usable) == 0:
         raise InputError(
-            "no valid observation in any photo", cure="check in the overlays of `align` that masks and meshes overlap"
+            "no valid observation in any photo",
+            cure="check in the overlays of `align` that masks and meshes overlap; `make status` names doubtful poses "
+            'that were left out, and SET="align.keep_doubtful=true" lets them in',
         )
     if (usable.radiance <= 0).all():
         raise InputError(

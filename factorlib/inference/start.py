@@ -337,13 +337,15 @@ def light_from_earlier(constant: Illumination, earlier: EarlierSolution, factor:
         return constant.light
     # a new photo has its exposure in the constant light, relative to the known photos
     exposure = np.where(is_new, constant_exposure + np.mean(exposure[~is_new] - constant_exposure[~is_new]), exposure)
-    tone = [model.tone[photo].exponent for photo in block.photos if photo in model.tone]
+    # a new photo has the mean tone curve of the known ones
+    tone = np.log([np.clip(model.tone[p].exponent, *TONE_RANGE) if p in model.tone else np.nan for p in block.photos])
+    tone = np.where(np.isnan(tone), np.nanmean(tone), tone) if np.isfinite(tone).any() else np.zeros(0)
     light = Light(
         lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True),
         np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
         np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
         exposure - exposure[0],
-        np.log(np.clip(tone, *TONE_RANGE)) if len(tone) == len(block.photos) else np.zeros(0),
+        tone,
         model.curvature(block.name),
     )
     sample = msgspec.structs.replace(constant, block=block.subsample(COMPARED, seed=0))

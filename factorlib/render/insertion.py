@@ -18,7 +18,10 @@ therefore right only for a ground that is mostly diffuse.
 
 The photo's own shadow is compared with the predicted one on the ground near its objects.  The measure is the
 correlation of log luminance of B with that of L₀ over these pixels.  On a plane in light from infinity, L₀ is
-proportional to the share of irradiance that the objects leave.
+proportional to the share of irradiance that the objects leave.  Its null is the correlation of wrong predictions: those
+of a constant light, which shape alone gives, and of the recovered light turned about the upright axis.  The shadow is
+believed if no turned light predicts the photo as well, and if the constant one does worse by the standard deviation
+over the turns, which is what a direction at random changes.
 
 The ground is a disc about the object.  Its diffuse reflectance is the one at which L₀ matches the photo.  Shadows fade
 out toward the rim of the disc, beyond which the geometry of the scene is unknown.
@@ -46,6 +49,7 @@ from factorlib.render.photo_scene import (
     PlacedMesh,
     crop_camera,
     light_entries,
+    rotate_light,
     shapes,
     visible_window,
 )
@@ -65,9 +69,9 @@ HAIR = 1e-4  # separation of surfaces that must not touch, in object sizes
 NEAR = 2.0  # radius in which shadows are compared, in object heights
 RIM = 2  # pixels beside the masks that the comparison of shadows leaves out
 FEWEST = 100  # least number of pixels for a comparison of shadows
-# Least correlation at which the predicted shadow is trusted.  On data/eames four photos have 0.39 to 0.86, and two 0.22
-# and 0.09.
-BELIEVED = 0.3
+# Turns of the light whose predictions are the null, in degrees.  A direction that is off by less than half a step may
+# still be believed.
+TURNS = tuple(range(45, 360, 45))
 GROUND = "+ground"
 BLACK = Reflectance((0.0,) * 3, (0.0,) * 3, 1.0)
 WHITE = Reflectance((1.0,) * 3, (0.0,) * 3, 1.0)
@@ -185,16 +189,24 @@ class ShadowMatch(msgspec.Struct, frozen=True):
         correlation: for the recovered light; None if there are too few pixels
         constant_light: for a constant light, the prediction from shape alone; None if there are too few pixels
         pixels: the number of pixels compared
+        turned_lights: for the recovered light turned about the upright axis by each of TURNS
     """
 
     correlation: float | None
     constant_light: float | None
     pixels: int
+    turned_lights: list[float] = []
+
+    @property
+    def needed(self) -> float:
+        """Correlation above which the shadow is believed: the best turned light's, and the constant one's and 1 σ."""
+        assert self.constant_light is not None  # pixels were compared
+        return max(*self.turned_lights, self.constant_light + float(np.std(self.turned_lights)))
 
     @property
     def doubtful(self) -> bool:
-        """True if the photo's ground contradicts the predicted shadow."""
-        return self.correlation is not None and self.correlation < BELIEVED
+        """True if wrong lights predict the photo's shading of the ground as well."""
+        return self.correlation is not None and self.correlation <= self.needed
 
     def __str__(self) -> str:
         if self.correlation is None:
@@ -204,11 +216,12 @@ class ShadowMatch(msgspec.Struct, frozen=True):
             )
         light = f"{self.correlation:.2f}"
         shape = f"{self.constant_light:.2f}"
+        turned = f"{max(self.turned_lights):.2f}"
         words = (
             f"The photo's shading of the ground correlates with the predicted one by {light}; "
-            f"with that of a constant light by {shape}."
+            f"with that of a constant light by {shape}, and with that of turned lights by {turned} at most."
         )
-        return f"{words} So do not trust the shadow." if self.doubtful else words
+        return f"{words} So do not trust the shadow, which needed {self.needed:.2f}." if self.doubtful else words
 
 
 class InsertionResult(msgspec.Struct, frozen=True):
@@ -325,8 +338,10 @@ def compare_shadow(
     shows_ground = binary_erosion((insertion.distance < 1) & ~covered & np.any(near, axis=0), iterations=RIM)
     disc = insertion.disc(Reflectance(vec3(result.ground), (0.0,) * 3, 1.0))
     constant = insertion.preview(disc, light={"light": {"type": "constant", "radiance": rgb(1.0)}})
+    lights = (rotate_light(insertion.scene.light, float(angle)) for angle in TURNS)
+    turned = [insertion.preview(disc, light=light_entries(light, insertion.scene.size)) for light in lights]
     _, middles = insertion.preview_camera
-    return shadow_match(photo[middles], result.without, constant, shows_ground[middles])
+    return shadow_match(photo[middles], result.without, constant, turned, shows_ground[middles])
 
 
 def _ground_colour(
@@ -380,19 +395,22 @@ def _coverage(insertion: InsertionScene, camera: Camera, samples: int, seed: int
     return coverage
 
 
-def shadow_match(photo: Picture, lit: Picture, constant: Picture, mask: Bool[np.ndarray, "h w"]) -> ShadowMatch:
-    """Return the correlation of the photo's shading of the ground with two predictions of it.
+def shadow_match(
+    photo: Picture, lit: Picture, constant: Picture, turned: Sequence[Picture], mask: Bool[np.ndarray, "h w"]
+) -> ShadowMatch:
+    """Return the correlation of the photo's shading of the ground with predictions of it.
 
     Args:
         photo: linear radiance
         lit: the ground with the photo's objects in the recovered light
         constant: the ground with the photo's objects in a constant light
+        turned: the ground with the photo's objects in turned lights
         mask: pixels that show ground
     """
-    luminances = [picture @ LUMINANCE for picture in (photo, lit, constant)]
+    luminances = [picture @ LUMINANCE for picture in (photo, lit, constant, *turned)]
     mask = mask & np.all([luminance > 0 for luminance in luminances], axis=0)
     logs = [np.log(luminance[mask]) for luminance in luminances]
     if mask.sum() < FEWEST or min(map(np.ptp, logs)) == 0:
         return ShadowMatch(None, None, int(mask.sum()))
-    recovered, shape = (float(np.corrcoef(logs[0], row)[0, 1]) for row in logs[1:])
-    return ShadowMatch(recovered, shape, int(mask.sum()))
+    recovered, shape, *wrong = (float(np.corrcoef(logs[0], row)[0, 1]) for row in logs[1:])
+    return ShadowMatch(recovered, shape, int(mask.sum()), wrong)

@@ -27,6 +27,7 @@ from torch import Tensor
 from factorlib.conventions import FRONT
 from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
 from factorlib.images.exr import read_exr
+from factorlib.images.tone import apply_tone
 from factorlib.inference.interreflection import bounced_light
 from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.lobes import Lobes, lobe_energy
@@ -247,6 +248,22 @@ def read_shading(folder: Path, photo: str) -> Float[np.ndarray, "2 h w 3"]:
     """Read the diffuse and the specular radiance of a photo's pixels from the folder of the stage `shading`."""
     channels = read_exr(folder / f"{photo}.exr")
     return np.stack([np.stack([channels[name] for name in SHADING[k : k + 3]], axis=-1) for k in (0, 3)])
+
+
+def paint_shading(shading: Path, photo: str, geometry: Channels, model: Model) -> Float[np.ndarray, "h w 3"]:
+    """Return a photo's radiance: its shading, with the detail of its diffuse reflectance and its tone curve.
+
+    Args:
+        shading: folder of the stage `shading`
+        photo: name of the photo
+        geometry: its maps, with channels detail.R, .G, .B where reflectance has detail
+        model: model of the solve
+    """
+    diffuse, specular = read_shading(shading, photo)
+    if "detail.R" in geometry:
+        diffuse = diffuse * np.stack([geometry[f"detail.{channel}"] for channel in "RGB"], axis=-1)
+    tone = model.tone.get(photo)
+    return apply_tone(diffuse + specular, tone.exponent, tone.pivot) if tone else diffuse + specular
 
 
 def reflect_bounces(material: Reflectance, bounced: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "2 n 3"]:

@@ -111,12 +111,12 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def solved(self) -> MaterialTable:
-        """Materials, gauge and model of the solve; without materials if there is no solve."""
+        """Gauge and model of the solve, and materials in its gauge; without materials if there is no solve."""
         return self.read(read_materials, "solve", "materials.json") or MaterialTable({})
 
     @cached_property
-    def exported(self) -> dict[str, SolvedMaterial]:
-        """The materials in the gauge of the exported lights."""
+    def materials(self) -> dict[str, SolvedMaterial]:
+        """The materials of materials.json, in the gauge of the exported lights; the page shows no others."""
         return (self.read(read_materials, "export", "materials.json") or MaterialTable({})).materials
 
     @cached_property

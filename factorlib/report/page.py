@@ -8,6 +8,7 @@ from operator import itemgetter
 from typing import Any
 from urllib.parse import quote
 
+from factorlib.evaluate.predicted_views import describe_views
 from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
@@ -67,6 +68,7 @@ def page(
         set=run.set,
         metrics=metrics,
         headlines=headlines(metrics),
+        tested=describe_views(metrics.views) if metrics.views else "",
         cautions=cautions(run, metrics),
         links=links(run),
         first=first,
@@ -160,16 +162,15 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
 
 def _materials(run: Artifacts, cells: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Return the table's row of each solved material; its ball is in the light of the photo that shows it most."""
-    solved = run.solved.materials
-    exported = run.exported
+    materials = run.materials
     facts = run.photo_facts
     rows = []
     for name, row in zip(run.set.materials, cells, strict=True):
-        if name in solved:
+        if name in materials:
             counts = {photo: fact.pixels.get(name, 0) for photo, fact in facts.items()}
             ball = max((c for c in row if c["uri"]), key=lambda c: counts.get(c["photo"], 0), default=None)
-            copies = forms(name, exported.get(name, solved[name]).reflectance)
-            rows.append({"name": name, "estimate": solved[name], "ball": ball, "counts": counts, "forms": copies})
+            copies = forms(name, materials[name].reflectance)
+            rows.append({"name": name, "estimate": materials[name], "ball": ball, "counts": counts, "forms": copies})
     return rows
 
 

@@ -1,4 +1,4 @@
-"""Result of the stage `exchange`, and the results that it replaces where it is kept."""
+"""Result of the stage `exchange`, and the results that it replaces where it solved again."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +16,7 @@ class Exchange(msgspec.Struct, frozen=True):
     """Decision on the exchange of paint and light.
 
     Attributes:
-        kept: True if the new results are used; False also where no texture was kept, and nothing was tried
+        kept: True if the new textures are used; False also where no texture was kept, and nothing was tried
         loss_before: mean loss of held-out photos under the kept textures, before the exchange
         loss_after: the same after it
     """

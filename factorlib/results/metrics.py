@@ -5,7 +5,7 @@ section.
 
 set          counts of photos, materials, illuminations and connected components of the observation matrix
 resynthesis  always present: `factorlib.evaluate.picture_errors`
-held_out     predictions of held-out photos, likewise; null without any
+held_out     predictions of held-out photos by a solve without them, likewise; null without any
 views        held-out photo -> picture -> PSNR: of the predicted view, and of pictures that need no materials; null
              without any (`factorlib.evaluate.predicted_views`)
 materials    `factorlib.evaluate.truth`
@@ -335,8 +335,8 @@ class Metrics(msgspec.Struct, frozen=True):
 
     @property
     def photos(self) -> dict[str, PhotoErrors]:
-        """Errors of all photos, solved or held out."""
-        return self.resynthesis.photos | (self.held_out.photos if self.held_out else {})
+        """Errors of all photos: re-synthesised, or else predicted."""
+        return (self.held_out.photos if self.held_out else {}) | self.resynthesis.photos
 
 
 def read_metrics(path: str | Path) -> Metrics:

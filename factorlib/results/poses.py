@@ -96,6 +96,11 @@ class PhotoPoses(msgspec.Struct, frozen=True):
     camera: CameraEntry
     objects: dict[str, ObjectPose]
 
+    @property
+    def left_out(self) -> list[str]:
+        """Names of the objects that the solve leaves out."""
+        return [name for name, pose in self.objects.items() if pose.left_out]
+
 
 def pose_fields(pose: Pose) -> dict[str, Any]:
     """Return a pose as the fields of a `PoseEntry`."""

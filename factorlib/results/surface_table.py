@@ -58,6 +58,13 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     displacements: dict[str, list[float]] = {}
     log_factors: dict[str, list[tuple[float, float, float]]] = {}
 
+    @property
+    def disagreement(self) -> float | None:
+        """RMS residual of photos that had no part in the surface, in σ of their noise; None if it was not measured."""
+        by = self.painted_by if self.painted else self.moved_by
+        loss = by.held_out_loss_with if self.painted or self.moved else by.held_out_loss_without
+        return None if loss is None else float(loss**0.5)  # ρ(r) ≈ r² where r is not an outlier
+
 
 def read_surface(folder: str | Path | None) -> SurfaceTable:
     """Read the table in a result folder of `surface`; without a folder, meshes are as given.

@@ -278,6 +278,27 @@ def test_photos_held_out_by_the_file_or_for_one_run_exist_and_leave_one_to_solve
     assert refusal("none is left to solve from", read_dataset, write(folder, spec)).key == "photos"
 
 
+@pytest.mark.parametrize("count, test", [(7, None), (8, "p4"), (9, "p4")])
+def test_of_eight_photos_in_a_light_the_middle_one_is_predicted_before_it_rejoins_unless_the_user_says_otherwise(
+    folder, count, test
+):
+    spec = copy.deepcopy(SPEC)
+    photo = spec["photos"][0] | {"illumination": "room"}
+    spec["photos"] = [photo | {"name": f"p{k}"} for k in range(count)]
+    dataset = read_dataset(write(folder, spec))
+    facts = dataset_slice(hold_out(dataset, []), "light").facts
+    apart = {"held_out": True, "rejoins": True}
+    plain = {"illumination": "room", "world_from_camera": None}
+    assert facts == {f"p{k}": plain | (apart if f"p{k}" == test else {}) for k in range(count)}
+    given = msgspec.convert(facts, dict[str, schema.LightSlice])
+    assert schema.solved_photos(schema.with_all_rejoined(given)) == list(facts)
+    for words, own in (["none"], None), (["p1"], "p1"):
+        facts = dataset_slice(hold_out(dataset, words), "light").facts
+        assert facts == {f"p{k}": plain | ({"held_out": True} if f"p{k}" == own else {}) for k in range(count)}
+    spec["photos"][count // 2]["objects"] = [spec["photos"][0]["objects"][0] | {"name": "seen_once"}]
+    assert hold_out(read_dataset(write(folder, spec)), []).test_photo in (("p3", "p5") if test else (None,))
+
+
 def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(folder):
     spec = changed("photos[2].illumination", "kitchen")
     spec["known"] = {

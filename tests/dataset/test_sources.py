@@ -105,6 +105,14 @@ def test_lights_are_fixed_to_the_models_world_where_asked_for(folder):
     turn = upright_turn([image.cam_from_world().inverse().rotation for image in images.values()]).matrix()
     assert np.allclose(np.array(facts["world_from_camera"]) @ [0, 0, 1], turn @ images["hall.png"].viewing_direction())
     own = read(folder, fixed, photo={"world_from_camera": TURN.tolist()})
+    origins = {words: dataset.up for words, dataset in {
+        "common horizon": read(folder, fixed),
+        "cameras.up: z": read(folder, fixed | {"up": "z"}),
+        "dataset.yaml gives": own,
+        "fixed to its camera": read(folder, {"colmap": "sparse/0"}),
+    }.items()}  # fmt: skip
+    assert all(words in up for words, up in origins.items()) and len(set(origins.values())) == 4
+    assert dataset_slice(own, "set").facts["up"] == own.up
     assert np.allclose(own.spec.photos[0].world_from_camera, TURN)
     matrix = images["attic.png"].cam_from_world().inverse().rotation.matrix()
     assert np.allclose(own.spec.photos[1].world_from_camera, matrix)  # beside one that stands there, none is turned

@@ -1,6 +1,7 @@
 """The stage on small real artifacts, with truth and without; and the verdict: its one integral, and what must hold whatever the weights are."""
 
 import math
+import shutil
 from typing import get_args, get_type_hints
 
 import msgspec
@@ -15,6 +16,7 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import read_json
 from factorlib.results.materials import Misfit, Reflectance, StandardErrors, attach_errors
 from factorlib.results.metrics import Metrics, Verdict
+from factorlib.results.surface_table import DetailEvidence, SurfaceTable
 from factorlib.runner.verbs import NO_TRUST
 from factorlib.stage import silent
 from stages import evaluate
@@ -92,6 +94,29 @@ def test_a_held_out_photo_is_scored_apart(tmp_path, linked):
     assert view["predicted"] > max(view["flat"], view["nearest_photo"])
 
 
+def test_a_photo_that_rejoined_is_predicted_by_the_first_solve_and_re_synthesised_by_the_second(tmp_path, linked):
+    inputs = make_artifacts(Made(tmp_path / "in", seen=LINKED, held_out=("dusk",)))
+    inputs.facts["dataset.light"]["dusk"]["rejoins"] = True
+    folders = inputs.folders | {"shading": tmp_path / "shading", "exchange": tmp_path / "exchange"}
+    shutil.copytree(inputs["solve"], tmp_path / "exchange" / "solve")
+    first = read_exr(inputs["masks"] / "dusk.exr")  # the first solve predicts the photo exactly, half by each part
+    (tmp_path / "shading").mkdir()
+    write_exr(
+        tmp_path / "shading" / "dusk.exr",
+        {f"{part}.{c}": 0.5 * first[c] for part in ("diffuse", "specular") for c in "RGB"},
+    )
+    result = evaluated(msgspec.structs.replace(inputs, folders=folders), tmp_path / "out")
+    assert result["resynthesis"] == linked["resynthesis"] and set(result["held_out"]["photos"]) == {"dusk"}
+    (view,) = result["views"].values()
+    known = metrics_of(tmp_path / "apart", seen=LINKED, held_out=("dusk",))["views"]["dusk"]
+    assert view["predicted"] > 60 > known["predicted"]
+    assert {k: v for k, v in view.items() if k != "predicted"} == {k: v for k, v in known.items() if k != "predicted"}
+    photos = msgspec.convert(result, Metrics).photos
+    assert photos["dusk"] == msgspec.convert(linked, Metrics).photos["dusk"]  # as it is re-synthesised
+    said = (tmp_path / "out" / "verdict.txt").read_text()
+    assert f"predicted to {view['predicted']:.1f} dB" in said and "is better than both" in said
+
+
 def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
     result = metrics_of(tmp_path, seen={"only": ["red"]}, truth=False)
     assert result["materials"] is result["light"] is result["relighting"] is result["relit_set"] is None
@@ -165,6 +190,27 @@ def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size
     assert ball_changes(
         {"red": attach_errors(TRUE["red"], nothing)}, {"day": LIGHT, "grey": uniform_light(np.ones(3))}
     ) == {"red": 0.0}
+
+
+@pytest.mark.parametrize("overlap, surface, words", [
+    (0.8, 4.0, "look at the overlay of 'dusk'"), (None, None, "look at the overlay of 'dusk'"),
+    (0.99, 4.0, "a mesh that is nearer"), (0.99, 1.0, "difference picture of 'dusk'"), (0.99, None, "difference picture"),
+])  # fmt: skip
+def test_advice_blames_outlines_only_where_they_differ_and_then_what_photos_disagree_about(overlap, surface, words):
+    inputs = msgspec.structs.replace(CLEAN, unexplained=1.0, photos=UNEXPLAINED, surface=surface)
+    if overlap is not None:
+        inputs = msgspec.structs.replace(inputs, overlaps={"day": {"chair": 0.5}, "dusk": {"chair": overlap}})
+    result = verdict(inputs)
+    assert words in result.next and ("overlay" in result.next) == words.startswith("look at the overlay")
+    assert any("disagree about the surface" in why for why in result.reasons) == (surface == 4.0)
+    assert result.terms == verdict(msgspec.structs.replace(CLEAN, unexplained=1.0, photos=UNEXPLAINED)).terms
+
+
+def test_a_surfaces_disagreement_is_the_residual_of_photos_that_had_no_part_in_what_is_kept():
+    moved, painted = DetailEvidence(4.0, 9.0), DetailEvidence(1.0, 4.0)
+    tables = [(SurfaceTable(True, moved, True, painted), 1.0), (SurfaceTable(True, moved, False, painted), 2.0)]
+    tables += [(SurfaceTable(False, moved, False, painted), 3.0), (SurfaceTable(), None)]
+    assert [table.disagreement for table, _ in tables] == [residual for _, residual in tables]
 
 
 def test_the_text_begins_with_the_word_that_the_runner_looks_for():

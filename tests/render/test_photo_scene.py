@@ -13,7 +13,15 @@ from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import LEVEL_DEG, floor_rim, ground_below, level_ground, on_floor
-from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compare_shadow, insert_object, shadow_match
+from factorlib.render.insertion import (
+    NEW,
+    TURNS,
+    GroundSurface,
+    InsertionScene,
+    compare_shadow,
+    insert_object,
+    shadow_match,
+)
 from factorlib.render.photo_scene import (
     ALL_BOUNCES,
     CAMERA_POSE,
@@ -413,15 +421,18 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
     rng = np.random.default_rng(0)
     lit, constant, where = rng.uniform(0.1, 1, (20, 30, 1)) * np.ones(3), np.ones((20, 30, 3)), np.ones((20, 30), bool)
     constant[:10] = 0.5
-    assert shadow_match(3 * lit**0.5, lit, constant, where).correlation == pytest.approx(1)
-    assert abs(shadow_match(lit, rng.uniform(0.1, 1, lit.shape), constant, where).correlation) < 0.2
+    turned = [lit[:, ::-1], constant]
+    match = shadow_match(3 * lit**0.5, lit, constant, turned, where)
+    assert match.correlation == pytest.approx(1) and match.turned_lights[1] == match.constant_light
+    assert abs(shadow_match(lit, rng.uniform(0.1, 1, lit.shape), constant, turned, where).correlation) < 0.2
     where[:, 3:] = False
     spoiled = np.where(where[..., None], lit, rng.uniform(0.1, 1, lit.shape))
-    few = shadow_match(spoiled, lit, constant, where)
+    few = shadow_match(spoiled, lit, constant, turned, where)
     assert few.correlation is None and few.pixels == 60 and "too little of the ground" in str(few)
     where[:, 3:8] = True
-    assert shadow_match(np.where(where[..., None], lit, 0.5), lit, constant, where).correlation == pytest.approx(1)
-    assert shadow_match(lit, np.ones_like(lit), constant, where).correlation is None
+    masked = np.where(where[..., None], lit, 0.5)
+    assert shadow_match(masked, lit, constant, turned, where).correlation == pytest.approx(1)
+    assert shadow_match(lit, np.ones_like(lit), constant, turned, where).correlation is None
 
     plain = render_scene(
         {**light_entries(light(), 6.0), **shapes([THERE], MATERIALS), "ground": floor()},
@@ -431,6 +442,8 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
     turned = msgspec.structs.replace(SCENE, light=Lobes(light().axis * [-1, 1, -1], light().sharpness, light().weight))
     other = match_of(turned, plain)
     assert match.correlation > 0.9 > match.constant_light > other.correlation and match.pixels == other.pixels > 500
+    assert not match.doubtful and other.doubtful
+    assert match.turned_lights[len(TURNS) // 2] == pytest.approx(other.correlation, abs=0.05)  # turned half around
 
 
 def floor() -> dict:

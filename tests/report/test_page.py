@@ -28,6 +28,7 @@ from factorlib.results.materials import (
     Reflectance,
     StandardErrors,
     attach_errors,
+    read_materials,
 )
 from factorlib.results.photos import PhotoFacts
 from factorlib.results.surface_table import DetailEvidence
@@ -193,6 +194,37 @@ def test_odd_sets_give_a_whole_page(odd, tmp_path):
         path.unlink()
     (inputs["train"] / "accuracy.json").unlink()
     parsed(page_of(inputs, tmp_path / "plain"))
+
+
+def test_the_first_number_is_of_a_photo_that_was_held_out_and_reflectances_are_those_of_materials_json(
+    report_page, tmp_path
+):
+    folder, inputs, html = report_page
+    view = read_json(folder / "evaluate" / "metrics.json")["views"]["dusk"]
+    summary = re.sub(r"<[^>]*>|data:[^\"]*", "", html.split('<section id="summary">')[1])
+    first = re.search(
+        r"(\d+\.\d) dB; the nearest photo laid over the mesh reaches (\S+) dB, and flat colours (\S+) dB", summary
+    )
+    assert [float(value) for value in first.groups()] == pytest.approx(
+        [view[name] for name in ("predicted", "nearest_photo", "flat")], abs=0.05
+    )
+    assert first.start() < summary.index("Relit pictures are expected") and summary[: first.start()].count(" dB") == 0
+    shutil.copytree(inputs["export"], tmp_path / "export")
+    table = read_materials(tmp_path / "export" / "materials.json")
+    halved = {
+        name: msgspec.structs.replace(each, diffuse=tuple(0.5 * value for value in each.diffuse))
+        for name, each in table.materials.items()
+    }
+    write_json(tmp_path / "export" / "materials.json", msgspec.structs.replace(table, materials=halved))
+    facts = inputs.facts | {"dataset.set": inputs.facts["dataset.set"] | {"up": "a spirit level says so"}}
+    page = page_of(
+        msgspec.structs.replace(inputs, facts=facts, folders=inputs.folders | {"export": tmp_path / "export"}),
+        tmp_path / "report",
+    )
+    assert "How up is known: a spirit level says so." in page and "How up is known" not in html
+    for name, each in halved.items():
+        shown = "  ".join(f"{value:.3f}" for value in each.diffuse)
+        assert shown in page and "  ".join(f"{value:.3f}" for value in table.materials[name].diffuse) not in page
 
 
 @pytest.mark.parametrize("kept", [True, False])

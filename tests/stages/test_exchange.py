@@ -1,4 +1,4 @@
-"""The stage `exchange`: it solves with the paint, and is kept only if held-out photos are predicted better."""
+"""The stage `exchange`: it solves with the paint if that predicts better, and with the photo that rejoins."""
 
 import logging
 import shutil
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import stages.solve
+from factorlib.dataset.schema import LightSlice, solved_photos
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_result, write_json
 from factorlib.light.lobes import Lobes
@@ -81,6 +82,37 @@ def test_where_nothing_is_predicted_better_all_stays(monkeypatch, tmp_path, pain
     assert [path.name for path in tmp_path.iterdir()] == [FILE]
     assert after.folders == inputs.folders | {"exchange": tmp_path}
     assert not caplog.messages
+
+
+@pytest.mark.parametrize("textured", [True, False])
+def test_a_photo_that_rejoins_is_solved_with_the_others_from_their_answer_without_paint_that_is_not_kept(
+    monkeypatch, tmp_path, painted, textured
+):
+    inputs, _ = painted
+    lights = inputs.facts["dataset.light"] | {
+        "b": inputs.facts["dataset.light"]["b"] | {"held_out": True, "rejoins": True}
+    }
+    inputs = msgspec.structs.replace(inputs, facts=inputs.facts | {"dataset.light": lights})
+    solves = []
+
+    def solve(params, given, out, progress, decided):
+        """Give back the solution from which it starts."""
+        photos = solved_photos(msgspec.convert(given.facts["dataset.light"], dict[str, LightSlice]))
+        solves.append((photos, given.folders.get("surface"), decided))
+        shutil.copytree(given["start"], out, dirs_exist_ok=True)
+
+    monkeypatch.setattr(stages.solve, "main", solve)
+    if not textured:
+        (tmp_path / "plain").mkdir()
+        write_json(tmp_path / "plain" / "texture.json", TextureTable())
+        inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": tmp_path / "plain"})
+    (out := tmp_path / "out").mkdir()
+    exchange.main(exchange.Params(), inputs, out, silent)
+    assert not read_result(out / FILE, Exchange, "exchange").kept
+    assert solves[-1] == (list(TURNS), None, True) and len(solves) == 1 + textured
+    after = with_exchange(msgspec.structs.replace(inputs, folders=inputs.folders | {"exchange": out}))
+    changed = {name for name in REPLACED if after[name] != inputs[name]}
+    assert changed == {"solve", "shading"} and {p.stem for p in (out / "shading").iterdir()} == set(TURNS)
 
 
 @pytest.mark.parametrize("kept, solver", [(False, "joint"), (True, "paper")])

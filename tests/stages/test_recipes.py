@@ -123,11 +123,15 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     assert error.key == "material"
 
 
-@pytest.mark.parametrize("correlation, doubtful", [(0.29, True), (0.31, False), (None, False)])
+@pytest.mark.parametrize("correlation, constant, turned, doubtful", [
+    (0.3, 0.28, [0.1, 0.2], True), (0.3, 0.28, [0.28, 0.29], False), (0.3, 0.1, [-0.1, 0.31], True),
+    (0.3, 0.1, [-0.1, 0.1], False), (0.8, 0.8, [0.8, 0.8], True), (None, None, [], False),
+])  # fmt: skip
 def test_a_shadow_that_the_photo_contradicts_is_a_warning_of_the_run(
-    grounded, tmp_path, monkeypatch, caplog, correlation, doubtful
+    grounded, tmp_path, monkeypatch, caplog, correlation, constant, turned, doubtful
 ):
-    match = ShadowMatch(correlation, 0.1, 500)
+    """One that wrong lights predict as well: turned ones, or the constant one within the deviation over turns."""
+    match = ShadowMatch(correlation, constant, 500, turned)
     monkeypatch.setattr("factorlib.render.recipe_pictures.compare_shadow", lambda *arguments: match)
     drawn(grounded, tmp_path / "out", kinds.InsertRecipe(photos=["front"], samples=1))
     caption = json.loads((tmp_path / "out" / "front.json").read_text())["caption"]

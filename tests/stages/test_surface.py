@@ -13,6 +13,7 @@ from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import write_exr
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, gather_observations
+from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
@@ -125,6 +126,20 @@ def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
     surface.main(surface.Params(shape="off"), Inputs({}), tmp_path, silent)
     assert read_surface(tmp_path) == SurfaceTable() == read_surface(None)
     assert [path.name for path in tmp_path.iterdir()] == ["surface.json"]
+
+
+def test_without_any_observation_the_doubtful_poses_are_named_that_were_left_out(tmp_path):
+    inputs = make_artifacts(Made(tmp_path, {"day": ["red"], "noon": ["red"]}))
+    for name in ("day", "noon"):
+        write_observations(
+            inputs["urm"] / f"{name}.parquet", read_observations(inputs["urm"] / f"{name}.parquet").take([])
+        )
+    refusal("no valid observation in any photo", surface.main, surface.Params(), inputs, tmp_path, silent)
+    poses = read_json(inputs["align"] / "poses.json")
+    poses["noon"]["objects"]["balls"] |= {"left_out": True, "doubts": ["it is mirrored"]}
+    write_json(inputs["align"] / "poses.json", poses)
+    error = refusal("are left out: 'balls' in 'noon'", surface.main, surface.Params(), inputs, tmp_path, silent)
+    assert "align.keep_doubtful=true" in error.cure
 
 
 @pytest.mark.long
