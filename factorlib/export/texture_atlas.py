@@ -1,8 +1,10 @@
 """Image textures of painted meshes: one atlas for all parts of a mesh, on a mesh of few triangles.
 
-Microsoft's UVAtlas (Zhou et al. 2004), in Open3D, makes few charts without folds and packs them.  It needs a surface on
-which at most two triangles meet at an edge, so the mesh is cut where more do.  Charts do not end at borders of
-materials: the image has the colour of each material on its own side.
+xatlas makes the charts and packs them.  It ends charts at every bump, so it is given a smoothed copy of the mesh, of
+several the one with the fewest charts.  It takes faces for coplanar if each differs from the next by less than some
+degrees, and so projects a finely divided sphere onto one plane or crashes, so the copy is roughened a little.  (UVAtlas
+in Open3D makes fewer charts, but not the same ones twice.)  Charts do not end at borders of materials: the image has
+the colour of each material on its own side.
 
 Every texel gets the colour of the nearest point of the painted mesh, which is finer than the exported one.  Texture
 coordinates (u, v) are right and up from the image's lower left corner, as in USD, Blender and PLY files.  Texels beyond
@@ -13,10 +15,10 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
+import xatlas
 from jaxtyping import Float, Int, UInt8
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csr_array, diags_array
 
 from factorlib.export.simplification import Surface, simplify
 from factorlib.geometry import open3d as o3d
@@ -26,7 +28,11 @@ from factorlib.meshes.mesh import Mesh, area_vectors, weld_vertices
 GUTTER = 4  # least number of texels between charts
 SMALLEST = 64  # least width and height of an image
 LARGEST = 4096
-MOST_STRETCH = 1 / 6  # of a chart, UVAtlas's own default
+SMOOTHING = (8, 10, 12, 14, 16)  # numbers of steps halfway to the mean of the neighbours
+MOST_CHARTS = 60  # number of charts at which no further smoothing is tried
+MOST_COST = 8.0  # of a chart of xatlas, whose default is 2
+ROUGHNESS = 0.01  # standard deviation of the noise on xatlas's vertices, in units of the root of a triangle's mean area
+LEAST_AREA = 1e-12  # least mean area of triangles, in units of the mesh's squared extent
 UNKNOWN_PIXEL = 0.005  # width of a texel without a photo, in units of the mesh's extent
 COVERED = 0.5  # share of an image that charts cover, as a first guess
 COARSE = 0.95  # share of the surface on which texels are smaller than asked for
@@ -75,8 +81,8 @@ def make_atlas(choices: Sequence[Mesh], painted: Mesh, pixel: float) -> Atlas:
     labels = np.unique([each.face_label for each in choices], axis=1, return_inverse=True)[1].reshape(-1)
     simple = simplify(msgspec.structs.replace(choices[0], face_label=(labels + 1).astype(np.int16)))
     area = float(np.linalg.norm(area_vectors(simple.vertices, simple.faces), axis=1).sum())
-    mesh, texel = unwrap(simple, image_size((area / COVERED) ** 0.5 / pixel))
-    size = image_size(texel / pixel)
+    mesh, texel, least = unwrap(simple, image_size((area / COVERED) ** 0.5 / pixel))
+    size = max(image_size(texel / pixel), least)
     surface = Surface(painted.vertices, painted.faces)
     source = surface.nearest(mesh.vertices[mesh.faces].mean(axis=1))[0]
     places, nearest = _texel_places(mesh, size)
@@ -93,8 +99,8 @@ def image_size(texels: float) -> int:
     return int(np.clip(np.ceil(texels), SMALLEST, LARGEST))
 
 
-def unwrap(mesh: Mesh, size: int) -> tuple[Mesh, float]:
-    """Return the mesh with texture coordinates, and the length of the image's side on the surface.
+def unwrap(mesh: Mesh, size: int) -> tuple[Mesh, float, int]:
+    """Return the mesh with texture coordinates, the image's side on the surface, and its least width with gutters.
 
     Vertices are repeated along the borders of charts.
 
@@ -102,22 +108,12 @@ def unwrap(mesh: Mesh, size: int) -> tuple[Mesh, float]:
         mesh: the mesh
         size: about the width of the image, in texels
     """
-    corners = _cut(weld_vertices(mesh.vertices)[mesh.faces])
+    node = weld_vertices(mesh.vertices)
     low = mesh.vertices.min(axis=0)
     extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
-    places = np.zeros((corners.max() + 1, 3), np.float32)
-    places[corners] = (mesh.vertices[mesh.faces] - low) / extent
-    surface = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(places), o3d.core.Tensor(corners.astype(np.int64)))
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        while True:
-            try:
-                surface.compute_uvatlas(size, GUTTER, MOST_STRETCH, 1, 1)
-                break
-            except RuntimeError:  # the gutters of many parts need more texels
-                size *= 2
-                if size > LARGEST:
-                    raise
-    uv = surface.triangle.texture_uvs.numpy().reshape(-1, 2)
+    places = np.zeros((node.max() + 1, 3))
+    places[node] = (mesh.vertices - low) / extent
+    uv, least = _fewest_charts(places, node[mesh.faces], size)
     key = np.column_stack([mesh.faces.reshape(-1), uv.view(np.int32)])
     _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
     vertex = mesh.faces.reshape(-1)[first]
@@ -127,7 +123,7 @@ def unwrap(mesh: Mesh, size: int) -> tuple[Mesh, float]:
     length = np.sqrt(areas[0] / np.maximum(areas[1], 1e-300))
     order = np.argsort(length)
     coarse = np.searchsorted(np.cumsum(areas[0][order]), COARSE * areas[0].sum())
-    return result, float(length[order[coarse]])
+    return result, float(length[order[coarse]]), least
 
 
 def _flat(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
@@ -136,19 +132,42 @@ def _flat(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     return np.pad(mesh.uv.astype(float), [(0, 0), (0, 1)])
 
 
-def _cut(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f 3"]:
-    """Return the faces with new vertices, shared only across edges of two faces that run along them oppositely."""
-    count = faces.size
-    following = np.arange(count).reshape(-1, 3)[:, [1, 2, 0]].reshape(-1)  # the next corner of each corner's face
-    ends = np.stack([faces.reshape(-1), faces.reshape(-1)[following]], axis=1)
-    edges, number, uses = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(number.reshape(-1), kind="stable")
-    last = np.cumsum(uses)[uses == 2] - 1
-    a, b = order[last - 1], order[last]
-    a, b = a[ends[a, 0] == ends[b, 1]], b[ends[a, 0] == ends[b, 1]]
-    pairs = np.vstack([np.column_stack([a, following[b]]), np.column_stack([following[a], b])])
-    graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
-    return connected_components(graph, directed=False)[1].reshape(-1, 3)
+def _fewest_charts(
+    places: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], size: int
+) -> tuple[np.ndarray, int]:
+    """Return texture coordinates at corners, float32 [3 f, 2], of the smoothing of fewest charts; and xatlas's width.
+
+    Args:
+        places: vertices, within the unit cube
+        faces: triangles
+        size: about the width of the image, in texels
+    """
+    # W averages over the neighbours of each vertex
+    ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = np.unique(np.vstack([ends, ends[:, ::-1]]), axis=0)
+    graph = csr_array((np.ones(len(ends)), ends.T), shape=(len(places),) * 2)
+    average = csr_array(diags_array(1 / np.maximum(np.asarray(graph.sum(axis=1)).reshape(-1), 1)) @ graph)
+    noise = np.random.default_rng(0).normal(0, ROUGHNESS, places.shape)
+    fewest = len(faces) + MOST_CHARTS + 1
+    smooth = places
+    for step in range(1, 1 + max(SMOOTHING)):
+        smooth = (smooth + average @ smooth) / 2
+        if step not in SMOOTHING or fewest <= MOST_CHARTS:
+            continue
+        area = np.linalg.norm(area_vectors(smooth, faces), axis=1).mean()
+        atlas = xatlas.Atlas()
+        atlas.add_mesh((smooth / max(area, LEAST_AREA) ** 0.5 + noise).astype(np.float32), faces.astype(np.uint32))
+        charts = xatlas.ChartOptions()
+        charts.max_cost = MOST_COST
+        packing = xatlas.PackOptions()
+        packing.resolution = size
+        packing.padding = GUTTER
+        atlas.generate(charts, packing)
+        if atlas.chart_count < fewest:
+            _, index, uv = atlas.get_mesh(0)
+            fewest, width = atlas.chart_count, max(atlas.width, atlas.height)
+            result = uv[index].reshape(-1, 2).astype(np.float32)
+    return result, min(width, LARGEST)
 
 
 def _texel_places(mesh: Mesh, size: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "s s"]]:

@@ -14,7 +14,7 @@ from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.reading import check_plain
 from factorlib.results.exchange import Exchange, read_exchange
 from factorlib.results.materials import Channels as Factors
-from factorlib.results.materials import MaterialTable, SolvedMaterial, read_exposures, read_materials
+from factorlib.results.materials import MaterialTable, PaintRange, SolvedMaterial, read_exposures, read_materials
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -117,7 +117,16 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def exported(self) -> dict[str, SolvedMaterial]:
         """The materials in the gauge of the exported lights."""
-        return (self.read(read_materials, "export", "materials.json") or MaterialTable({})).materials
+        return self._exported_table.materials
+
+    @property
+    def paint(self) -> dict[str, PaintRange]:
+        """The paint that reflects more than it receives, by material."""
+        return self._exported_table.gauge.paint or {}
+
+    @cached_property
+    def _exported_table(self) -> MaterialTable:
+        return self.read(read_materials, "export", "materials.json") or MaterialTable({})
 
     @cached_property
     def exposures(self) -> dict[str, Factors]:

@@ -134,6 +134,7 @@ def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
         errors={name: errors[name] for name in run.set.photos if name in errors},
         poses={name: poses[name] for name in run.set.photos if name in poses},
         low_iou=LOW_IOU,
+        paint={name: each.above for name, each in run.paint.items()},
         lights=len(run.illuminations()),
         pixels={name: sum(photo.pixels.get(name, 0) for photo in facts) for name in run.set.materials},
     )
