@@ -6,7 +6,7 @@ illumination/<light>.exr, .hdr   Environment maps; a light with suns also gets <
 coverage/<light>.exr             Standard error of radiance over its mean, in the same layout.
 materials.json, lobes.parquet, exposures.json, lights.json
 scenes/<photo>.xml               Mitsuba scenes, with meshes and lights; the same scenes for Blender and as OpenUSD.
-scenes/meshes/<mesh>.<material>.png  Diffuse reflectance of a painted part as an image.
+scenes/meshes/<mesh>.png         Diffuse reflectance of a painted mesh as an image.
 materials.mtlx, <mesh>.glb, meshes/<mesh>.ply
 losses.json                      Properties that each format cannot express.
 dataset.json, source/            Facts and meshes of the dataset, for new pictures of the result.
@@ -39,7 +39,8 @@ from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge, write_scene
 from factorlib.export.other_renderers import differences
 from factorlib.export.usd import SUFFIX, write_usd_scene
-from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_hdr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
+from factorlib.inference.aligned_photo import read_aligned_photos
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
@@ -82,8 +83,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(next(counter), total, "materials")
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
-    table, solved, exposures = _solution_in_gauge(inputs["solve"], slices)
-    materials = reflectances(table)
+    files = MeshFiles(inputs, out / "scenes", names, params.crease_deg)
+    table, solved, exposures = _solution_in_gauge(inputs["solve"], slices, files, objects)
+    files.solved = materials = reflectances(table)
     write_json(out / "materials.json", _with_textures(table, inputs.folders.get("texture")))
     write_json(out / "exposures.json", exposures)
     _write_tables(out, materials, solved)
@@ -91,20 +93,21 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for name, lobes in solved.items():
         progress(next(counter), total, f"light of {name}")
         _write_light(out, name, lobes, inputs["solve"] / "coverage" / f"{name}.exr", params)
-    files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
+    photos = read_aligned_photos(inputs, objects)
     for name, mesh in meshes.items():
         progress(next(counter), total, f"mesh {name}")
         overrides = [o.materials for each in objects.values() for o in each.objects if o.mesh == name and o.materials]
         variants = {variant_name(each): files.read.mesh(name, mesh, each) for each in overrides}
         whole = files.read.mesh(name, mesh)
-        write_glb(out / f"{name}.glb", whole, names, materials, dict(sorted(variants.items())))
+        atlas = files.atlas(name, objects, photos)
+        write_glb(out / f"{name}.glb", whole, names, materials, dict(sorted(variants.items())), atlas)
         write_ply(out / "meshes" / f"{name}.ply", whole)
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")
     depth = ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, slice_ in slices.items():
         progress(next(counter), total, f"scene of {photo}")
-        height, width = read_exr(inputs["align"] / f"{photo}.exr")["label"].shape
+        height, width = photos[photo].geometry["label"].shape
         camera = poses[photo].camera.camera(width, height)
         placed = objects[photo]
         shapes = [s for obj in placed.objects for s in files.shapes(obj, placed.meshes, poses[photo].objects)]
@@ -113,20 +116,21 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         light = ExposedMap(f"../illumination/{slice_.illumination}.exr", exposure, turn)
         scene = ExportedScene(camera, shapes, materials, light, depth)
         _write_scenes(out / "scenes", photo, scene, solved[slice_.illumination], params)
-    images = {f"scenes/{file}": name for file, name in files.images.items()}
+    images = {f"scenes/{file}": painted for file, painted in files.images.items()}
     write_text(out / "materials.mtlx", materialx(materials, images))
     progress(total, total)
 
 
 def _solution_in_gauge(
-    folder: Path, slices: Mapping[str, LightSlice]
+    folder: Path, slices: Mapping[str, LightSlice], files: MeshFiles, objects: Mapping[str, ObjectsSlice]
 ) -> tuple[MaterialTable, dict[str, Lobes], dict[str, Vec3]]:
     """Read materials, lights and exposures in the gauge of Mitsuba, max k_d + max k_s < 1.
 
     One factor multiplies all reflectances and divides all lights.  A light that was not solved for is black.
     """
     table = read_materials(folder / "materials.json")
-    factor = headroom_factor(table.materials)
+    paint = files.paint_ranges(objects, reflectances(table))
+    factor = headroom_factor(table.materials, paint)
     solved = read_lobes(folder / "lobes.parquet")
     lights = {}
     for name in sorted({light.illumination for light in slices.values()}):
@@ -135,7 +139,7 @@ def _solution_in_gauge(
                 "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
             )
         lights[name] = solved.get(name, no_lobes()).scale(1 / factor)
-    return table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json")
+    return table_in_gauge(table, factor, paint), lights, read_exposures(folder / "exposures.json")
 
 
 def _with_textures(table: MaterialTable, texture: Path | None) -> MaterialTable:

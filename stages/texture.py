@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, solved_photos
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.tone import invert_tone
-from factorlib.inference.aligned_photo import AlignedPhoto, read_aligned_photos, visible_meshes
+from factorlib.inference.aligned_photo import AlignedPhoto, pixel_on_mesh, read_aligned_photos, visible_meshes
 from factorlib.inference.surface_turns import Surfaces
 from factorlib.inference.texture import STIFFNESSES, TextureSamples, observe_texture, select_texture
 from factorlib.jsonfile import write_json
@@ -216,15 +216,8 @@ class SolvedPhotos(msgspec.Struct, frozen=True):
 
 def longest_edge(name: str, mesh: Mesh, photos: dict[str, AlignedPhoto], pixels: float) -> float:
     """Return the longest edge of a textured mesh, in units of its extent, from the size of the photos' pixels on it."""
-    extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-    sizes = []
-    for photo in photos.values():
-        for number, entry in enumerate(photo.objects.objects, start=1):
-            depth = photo.geometry["depth"][np.rint(photo.geometry["object"]) == number]
-            if entry.mesh == name and len(depth):
-                scale = float(np.mean(photo.poses.objects[entry.name].scale))
-                sizes.append(float(np.median(depth)) / photo.poses.camera.focal_px / (scale * extent))
-    return float(np.clip(pixels * np.median(sizes), FINEST, COARSEST)) if sizes else COARSEST
+    pixel = pixel_on_mesh(name, mesh, photos)
+    return COARSEST if pixel is None else float(np.clip(pixels * pixel, FINEST, COARSEST))
 
 
 def attach_to_meshes(

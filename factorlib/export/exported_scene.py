@@ -44,7 +44,7 @@ class ExportedShape(msgspec.Struct, frozen=True):
     Attributes:
         file: relative to the scene
         two_sided: True if the inside can be visible
-        painted: True if k_d has detail: the colours of the file's vertices, and `image` by texture coordinates
+        image: file of k_d as an sRGB image by the texture coordinates of `file`, if it is painted, else empty
     """
 
     name: str
@@ -52,12 +52,12 @@ class ExportedShape(msgspec.Struct, frozen=True):
     material: str
     cam_from_object: Float[np.ndarray, "4 4"]
     two_sided: bool
-    painted: bool = False
+    image: str = ""
 
     @property
-    def image(self) -> str:
-        """The file of a painted shape's k_d as an sRGB image, relative to the scene."""
-        return str(PurePosixPath(self.file).with_suffix(".png"))
+    def vertex_colours(self) -> str:
+        """The file of a painted shape whose vertices have its colours, relative to the scene."""
+        return str(PurePosixPath(self.file).with_suffix(".vertices.ply"))
 
     @property
     def world_from_object(self) -> Float[np.ndarray, "4 4"]:
@@ -150,7 +150,7 @@ def write_scene_json(path: str | Path, scene: ExportedScene) -> None:
                 "principal_point": camera.centre,
             },
             "shapes": [
-                _to_dict(shape, "name", "file", "material", "cam_from_object", *["image"] * shape.painted)
+                _to_dict(shape, "name", "file", "material", "cam_from_object", *["image"] * bool(shape.image))
                 for shape in scene.shapes
             ],
             "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},

@@ -1,14 +1,15 @@
 """Export of meshes as binary glTF with materials and their variants, and of suns as directional lights.
 
-glTF's metallic-roughness model has GGX of the same α = roughness².  A dielectric with KHR_materials_specular has F0 =
-0.04 · specularFactor · specularColor and F90 = specularFactor, over a diffuse part times 1 − max F.  The values
+glTF's metallic-roughness model has GGX of the same α = roughness², with Schlick's Fresnel term from F0 to F90, over a
+diffuse part times 1 − max F.  A dielectric has F90 = 1 and F0 = 0.04, which KHR_materials_specular multiplies by
+specularColor.  The solved k_s has no Fresnel term: it is F averaged over the angles of the photos, which is F0 + ADDED
+for plastics.  So k_s = 0.04 + ADDED is the ordinary dielectric, which viewers without the extension show as well, and
 
-    specularFactor = max k_s,  specularColor = k_s / (0.04 max k_s),  baseColor = k_d / (1 − max k_s),  metallic 0
+    F0 = k_s − ADDED,  but in proportion to k_s below the ordinary dielectric, where the difference would reach 0
+    specularFactor = 1,  specularColor = F0 / 0.04,  baseColor = k_d / (1 − max k_s),  metallic 0
 
-give a reflectance at normal incidence of exactly k_d and k_s, and no Fresnel term if k_s is grey.  baseColor is at most
-one because max k_d + max k_s is.  Viewers without the extension show the default F0 of 0.04, which would turn a metal
-into black plastic.  A material with max k_d at most METAL times max k_s is therefore written without k_d, as baseColor
-= k_s, metallic 1.  All viewers then show F0 = k_s and F90 = 1.
+baseColor is at most one because max k_d + max k_s is.  A k_s above that of any dielectric with little k_d is a metal:
+metallic 1, and baseColor = k_d + k_s, because a metal has no diffuse part.  Without k_s specularFactor is 0.
 
 A directional light of KHR_lights_punctual shines along its node's −z with an illuminance in lux.  The value written is
 the irradiance in the unit of the map's radiance, as a program that also shows the map needs it.
@@ -27,7 +28,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from factorlib.export.exported_scene import Sun
-from factorlib.export.texture_atlas import bake, unwrap
+from factorlib.export.texture_atlas import UNKNOWN_PIXEL, Atlas, make_atlas
 from factorlib.images.picture import data_uri
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
@@ -37,7 +38,10 @@ from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes
 
 DIELECTRIC = 0.04  # F0 of glTF's dielectric
-METAL = 0.02  # largest max k_d / max k_s of a material written as a metal
+ADDED = 1 / 75  # k_s − F0 of Lambert + GGX fitted to plastics with Fresnel (docs/formats.md)
+# Largest F0 of a dielectric, that of an index of refraction of 1.8 (the range of "specular" of Burley 2012).
+MOST_DIELECTRIC = 0.08
+METAL = 0.25  # largest max k_d / max k_s of a material written as a metal
 EXTENSION = "KHR_materials_specular"
 LIGHTS = "KHR_lights_punctual"
 VARIANTS = "KHR_materials_variants"
@@ -49,11 +53,11 @@ def write_glb(
     names: Sequence[str],
     materials: Mapping[str, Reflectance],
     variants: Mapping[str, Mesh] = {},
+    atlas: Atlas | None = None,
 ) -> None:
     """Write a mesh in its own frame and units, with the materials of its parts.
 
-    Detail of diffuse reflectance becomes an image, which glTF multiplies by the base colour.  Neither may exceed 1.
-    The base colour takes the largest factor up to that limit; brighter texels are clamped.
+    Detail of diffuse reflectance becomes an image of the base colour of all parts, on the mesh of the atlas.
 
     Args:
         path: the file to write
@@ -61,52 +65,53 @@ def write_glb(
         names: label k is names[k − 1]
         materials: reflectances by name
         variants: the mesh with other labels and detail of the same faces, by variant name (KHR_materials_variants)
+        atlas: atlas of the mesh, if it or a variant has detail; None to make one
     """
-    # one primitive per combination of the faces' own label and their labels in each variant
     versions = [mesh, *variants.values()]
-    choices, choice = np.unique([each.face_label for each in versions], axis=1, return_inverse=True)
-    split = [msgspec.structs.replace(each, face_label=choice.reshape(-1) + 1) for each in versions]
+    exported = versions
+    if any(each.detail is not None for each in versions):
+        atlas = atlas or make_atlas(versions, mesh, UNKNOWN_PIXEL * float(np.ptp(mesh.vertices, axis=0).max()))
+        exported = [atlas.dress(each) for each in versions]
+    # one primitive per combination of the faces' own label and their labels in each variant
+    choices, choice = np.unique([each.face_label for each in exported], axis=1, return_inverse=True)
+    split = msgspec.structs.replace(exported[0], face_label=choice.reshape(-1) + 1)
+    looks = [_looks(each, names, materials, atlas) for each in versions]
     scene = trimesh.Scene()
     parts: dict[str, list[dict[str, Any]]] = {}
-    images: list[str] = []
     for label, selected in enumerate(choices.T, start=1):
-        alike = [submesh(each, label) for each in split]
-        if any(each.detail is not None for each in alike):
-            alike = [unwrap(each) for each in alike]
         chosen = [names[k - 1] for k in selected]
         name = chosen[0] if chosen[0] not in parts else f"{chosen[0]} {label}"
-        part = alike[0]
+        part = submesh(split, label)
         visual = TextureVisuals(part.uv, PBRMaterial(name=name))
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
-        parts[name] = [
-            _entry(each, materials[each], painted, images) for each, painted in zip(chosen, alike, strict=True)
-        ]
-    exact = partial(_set_materials, parts=parts, variants=list(variants), images=images)
+        parts[name] = [{"doubleSided": part.open, **look[k]} for look, k in zip(looks, selected, strict=True)]
+    exact = partial(_set_materials, parts=parts, variants=list(variants))
     write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))
 
 
-def _entry(name: str, material: Reflectance, part: Mesh, images: list[str]) -> dict[str, Any]:
-    """Return a material of the file for a part; its image, if it is painted, is added to `images`."""
-    exact = gltf_material(material, part.detail is not None)
-    core = exact["pbrMetallicRoughness"]
-    if part.detail is not None:
-        base = core["baseColorFactor"][:3]
-        # values of the image in [0, 1]; the base colour takes their largest value, up to 1 itself
-        factor = min(float(part.detail.max()), 1 / max(*base, 1e-9))
-        core["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base), 1.0]
-        image = data_uri(bake(part, 1 / factor))
-        if image not in images:
-            images.append(image)
-        core["baseColorTexture"] = {"index": images.index(image)}
-    return {"name": name, "doubleSided": part.open, **exact}
+def _looks(
+    mesh: Mesh, names: Sequence[str], materials: Mapping[str, Reflectance], atlas: Atlas | None
+) -> dict[int, dict[str, Any]]:
+    """Return the material of the file for each label of a mesh; one that is painted has an image as data URI."""
+    painted = [label for label in mesh.labels if submesh(mesh, label).detail is not None]
+    looks = {}
+    for label in mesh.labels:
+        name = names[label - 1]
+        looks[label] = {"name": name, **gltf_material(materials[name], label in painted)}
+    if atlas is not None and painted:
+        colours = np.zeros((len(names), 3))
+        for label, look in looks.items():
+            colours[label - 1] = look["pbrMetallicRoughness"]["baseColorFactor"][:3]
+        image = data_uri(atlas.bake(mesh, colours))
+        for label in painted:
+            core = looks[label]["pbrMetallicRoughness"]
+            looks[label]["pbrMetallicRoughness"] = core | {"baseColorFactor": [1.0] * 4, "baseColorTexture": image}
+    return looks
 
 
 def _set_materials(
-    tree: dict[str, Any],
-    parts: Mapping[str, Sequence[dict[str, Any]]],
-    variants: Sequence[str],
-    images: Sequence[str],
+    tree: dict[str, Any], parts: Mapping[str, Sequence[dict[str, Any]]], variants: Sequence[str]
 ) -> None:
     """Set the materials, variants and images of a glTF tree exactly.
 
@@ -114,12 +119,16 @@ def _set_materials(
     materials of each mesh by name: its own first, then one per variant.
     """
     tree["materials"] = materials = []
-    if images:
-        tree["images"] = [{"uri": image} for image in images]
-        tree["textures"] = [{"source": number} for number in range(len(images))]
+    images: list[str] = []
     for mesh in tree["meshes"]:
         numbers = []
         for entry in parts[mesh["name"]]:
+            core = entry["pbrMetallicRoughness"]
+            if image := core.get("baseColorTexture"):
+                if image not in images:
+                    images.append(image)
+                core = core | {"baseColorTexture": {"index": images.index(image)}}
+            entry = entry | {"pbrMetallicRoughness": core}
             if entry not in materials:
                 materials.append(entry)
             numbers.append(materials.index(entry))
@@ -131,6 +140,9 @@ def _set_materials(
                 for k in sorted(set(numbers[1:]))
             ]
             primitive["extensions"] = {VARIANTS: {"mappings": mappings}}
+    if images:
+        tree["images"] = [{"uri": image} for image in images]
+        tree["textures"] = [{"source": number} for number in range(len(images))]
     if variants:
         tree["extensions"] = {VARIANTS: {"variants": [{"name": name} for name in variants]}}
     extensions = {*tree.get("extensionsUsed", []), *(name for each in materials for name in each.get("extensions", ()))}
@@ -182,13 +194,18 @@ def gltf_material(material: Reflectance, painted: bool = False) -> dict[str, Any
     A `painted` material has a texture, which holds detail of k_d.  It is never written as a metal.
     """
     brightest = max(material.specular)
-    if brightest > 0 and max(material.diffuse) <= METAL * brightest and not painted:
-        metal = {"baseColorFactor": [*material.specular, 1.0], "metallicFactor": 1.0}
+    mostly_specular = brightest - ADDED > MOST_DIELECTRIC and max(material.diffuse) <= METAL * brightest
+    if mostly_specular and not painted:
+        base = np.add(material.diffuse, material.specular)
+        metal = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 1.0}
         return {"pbrMetallicRoughness": metal | {"roughnessFactor": material.roughness}}
     base = np.array(material.diffuse) / (1 - brightest)
-    colour = np.array(material.specular) / (DIELECTRIC * brightest) if brightest > 0 else np.ones(3)
+    ordinary = DIELECTRIC + ADDED
+    f0 = np.maximum(
+        np.array(material.specular) - ADDED, np.minimum(material.specular, ordinary) * DIELECTRIC / ordinary
+    )
     plain = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness}
-    specular = {"specularFactor": brightest, "specularColorFactor": colour.tolist()}
+    specular = {"specularFactor": float(brightest > 0), "specularColorFactor": (f0 / DIELECTRIC).tolist()}
     return {"pbrMetallicRoughness": plain, "extensions": {EXTENSION: specular}}
 
 

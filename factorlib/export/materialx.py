@@ -9,8 +9,8 @@ are
 
     specular = max k_s,  specular_color = k_s / max k_s,  specular_IOR = 10⁴,  base_color = k_d / (1 − max k_s)
 
-A painted part of a mesh has two materials more, m_<material>__<mesh>_<material>, whose diffuse colour is the part's
-image of k_d (sRGB, by the texture coordinates `st`) in place of the constant.
+A painted part of a mesh has two materials more, m_<material>__<mesh>, whose diffuse colour is the mesh's image of k_d
+(sRGB, by the texture coordinates `st`) in place of the constant.
 
 MaterialX's renderers differ from the solved model.  They shadow with the height-correlated Smith term and compensate
 for the energy of multiple scattering (measured by `factorlib.export.other_renderers`).
@@ -25,18 +25,18 @@ from factorlib.results.materials import Reflectance
 NO_FRESNEL = 1e4  # index of refraction: F0 = 0.9996
 
 
-def materialx(materials: Mapping[str, Reflectance], images: Mapping[str, str] = {}) -> str:
+def materialx(materials: Mapping[str, Reflectance], images: Mapping[str, Sequence[str]] = {}) -> str:
     """Return a document with two `surfacematerial` per material: m_<name> and m_<name>_standard_surface.
 
     The second is for programs without the nodes of the first.  Images of painted parts have two materials each as well.
 
     Args:
         materials: reflectances by name
-        images: names of the materials of painted parts, by the files of their images of k_d, relative to the document
+        images: materials of a mesh's painted parts, by the file of its image of k_d, relative to the document
     """
     document = ET.Element("materialx", version="1.39", colorspace="lin_rec709")
     looks: list[tuple[str, str, str | None]] = [(name, name, None) for name in materials]
-    looks += [(f"{name}__{PurePosixPath(file).stem}", name, file) for file, name in images.items()]
+    looks += [(f"{name}__{PurePosixPath(file).stem}", name, file) for file, names in images.items() for name in names]
     for title, name, file in looks:
         prefix = f"m_{title.replace('-', '_').replace('.', '_')}"
         if file:

@@ -9,7 +9,8 @@ Light     A map, and a directional emitter for each sun.  `max_depth` is as in t
 Gauge     Mitsuba refuses reflectances above one, and its mixture needs max k_d + max k_s ≤ 1 − 1e-5 of every material.
           Only the product of reflectance and light is known.  If a material exceeds the limit, one factor for the whole
           set moves from all reflectances into all lights.  Every material then keeps its radiance in every light, also
-          across photos that share nothing.
+          across photos that share nothing.  Paint counts by its brightest places but for a thousandth of its surface,
+          which is written as 1.
 """
 
 import xml.etree.ElementTree as ET
@@ -21,7 +22,8 @@ import msgspec
 import numpy as np
 
 from factorlib.export.exported_scene import ExportedScene
-from factorlib.results.materials import MaterialTable, Reflectance, SolvedMaterial, StandardErrors
+from factorlib.meshes.mesh import Mesh, area_vectors
+from factorlib.results.materials import MaterialTable, PaintRange, Reflectance, SolvedMaterial, StandardErrors
 from factorlib.tracing.scene import bsdf
 from factorlib.wholefile import write_text
 
@@ -42,15 +44,15 @@ def write_scene(path: str | Path, scene: ExportedScene) -> None:
     for sun in scene.suns:
         shines = {"type": "directional", "direction": -sun.direction}
         _add(root, "emitter", {**shines, "irradiance": {"type": "rgb", "value": sun.irradiance}})
-    for name, two_sided, painted in sorted({(s.material, s.two_sided, s.painted) for s in scene.shapes}):
+    for name, two_sided, painted in sorted({(s.material, s.two_sided, bool(s.image)) for s in scene.shapes}):
         surface = bsdf(scene.materials[name], painted)
         surface = {"type": "twosided", "bsdf": surface} if two_sided else surface
         _add(root, "bsdf", surface, id=_id(name, two_sided, painted))
     for shape in scene.shapes:
-        file = {"type": "ply", "filename": shape.file}
+        file = {"type": "ply", "filename": shape.vertex_colours if shape.image else shape.file}
         place = _matrix(shape.world_from_object)
         element = _add(root, "shape", {**file, "to_world": place}, id=shape.name)
-        ET.SubElement(element, "ref", id=_id(shape.material, shape.two_sided, shape.painted))
+        ET.SubElement(element, "ref", id=_id(shape.material, shape.two_sided, bool(shape.image)))
     ET.indent(root, " ")
     write_text(path, ET.tostring(root, encoding="unicode") + "\n")
 
@@ -126,26 +128,42 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 HEADROOM = 1e-5
+BRIGHTEST_SHARE = 1e-3  # share of a painted surface that may exceed the limit: single nodes do not set the scale
 RULE = (
-    "where max diffuse + max specular of a material exceeds 1 - 1e-5, "
+    "where max diffuse + max specular of a material or of its paint exceeds 1 - 1e-5, "
     "one factor moves from all reflectances to all lights"
 )
 
 
-def headroom_factor(materials: Mapping[str, Reflectance]) -> float:
-    """Return the factor that brings all reflectances within the limit; 1 if they already are.
+def headroom_factor(materials: Mapping[str, Reflectance], paint: Mapping[str, PaintRange] = {}) -> float:
+    """Return the factor that brings all reflectances and all paint within the limit; 1 if they already are.
 
     >>> headroom_factor({"red": Reflectance((0.9, 0.1, 0.1), (0.1, 0.1, 0.3), 0.3)})
     0.8333250000000001
     """
-    brightest = max((m.total for m in materials.values()), default=0.0)
+    brightest = max([*(m.total for m in materials.values()), *(p.brightest for p in paint.values())], default=0.0)
     limit = 1 - HEADROOM
     return 1.0 if brightest <= limit else limit / brightest
 
 
-def table_in_gauge(table: MaterialTable, factor: float) -> MaterialTable:
+def paint_range(material: Reflectance, meshes: Iterable[Mesh]) -> PaintRange:
+    """Return the brightest paint of a material on parts of it that have detail."""
+    # k_d f of Mitsuba's mixture, which is at most 1 where k_d f · total / max k_d is
+    factors = [mesh.detail[mesh.faces].mean(axis=1) for mesh in meshes if mesh.detail is not None]
+    areas = [np.linalg.norm(area_vectors(m.vertices, m.faces), axis=1) for m in meshes if m.detail is not None]
+    if not factors or max(material.diffuse) == 0:
+        return PaintRange(0.0, 0.0)
+    brightness = material.total / max(material.diffuse) * (np.vstack(factors) * material.diffuse).max(axis=1)
+    area = np.concatenate(areas)
+    order = np.argsort(-brightness)
+    place = int(np.searchsorted(np.cumsum(area[order]), BRIGHTEST_SHARE * area.sum()))
+    return PaintRange(float(brightness[order[place]]), float(area[brightness > 1].sum() / area.sum()))
+
+
+def table_in_gauge(table: MaterialTable, factor: float, paint: Mapping[str, PaintRange] = {}) -> MaterialTable:
     """Return the table with reflectances and standard errors times `factor`, which `gauge` records."""
-    gauge = msgspec.structs.replace(table.gauge, export_factor=factor, export_rule=RULE)
+    above = {name: each for name, each in sorted(paint.items()) if each.above > 0}
+    gauge = msgspec.structs.replace(table.gauge, export_factor=factor, export_rule=RULE, paint=above or msgspec.UNSET)
 
     def scale(values: SolvedMaterial | StandardErrors) -> SolvedMaterial | StandardErrors:
         """Return the diffuse and specular values times the factor."""

@@ -143,7 +143,7 @@ def _light(light: ExposedMap) -> list[str]:
 
 def _look(shape: ExportedShape) -> str:
     """Return the name of a shape's material in the scene; each painted part has its own."""
-    return f"{shape.material} ({PurePosixPath(shape.file).stem})" if shape.painted else shape.material
+    return f"{shape.material} ({PurePosixPath(shape.file).stem})" if shape.image else shape.material
 
 
 def _materials(scene: ExportedScene, named: Mapping[str, str]) -> list[str]:
@@ -153,7 +153,7 @@ def _materials(scene: ExportedScene, named: Mapping[str, str]) -> list[str]:
         shader = ['uniform token info:id = "UsdPreviewSurface"']
         path = f"/scene/materials/{identifier}"
         inputs = shader_inputs(scene.materials[shapes[name].material])
-        textured = shapes[name].painted and inputs["useSpecularWorkflow"] == 1  # a metal has no k_d
+        textured = shapes[name].image and inputs["useSpecularWorkflow"] == 1  # a metal has no k_d
         for key, value in inputs.items():
             if key == "diffuseColor" and textured:
                 shader.append(f"color3f inputs:{key}.connect = <{path}/texture.outputs:rgb>")

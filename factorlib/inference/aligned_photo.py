@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import msgspec
 import numpy as np
 from jaxtyping import Int
@@ -56,6 +58,19 @@ def read_aligned_photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict
         name: AlignedPhoto(read_exr(inputs["align"] / f"{name}.exr"), slices[name], poses[name])
         for name in sorted(slices)
     }
+
+
+def pixel_on_mesh(name: str, mesh: Mesh, photos: Mapping[str, AlignedPhoto]) -> float | None:
+    """Return the width of a typical photo's pixel on a mesh, in units of its extent; None if no photo shows it."""
+    extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
+    sizes = []
+    for photo in photos.values():
+        for number, entry in enumerate(photo.objects.objects, start=1):
+            depth = photo.geometry["depth"][np.rint(photo.geometry["object"]) == number]
+            if entry.mesh == name and len(depth):
+                scale = float(np.mean(photo.poses.objects[entry.name].scale))
+                sizes.append(float(np.median(depth)) / photo.poses.camera.focal_px / (scale * extent))
+    return float(np.median(sizes)) if sizes else None
 
 
 def visible_meshes(read: MeshCache, slices: dict[str, ObjectsSlice]) -> dict[str, Mesh]:

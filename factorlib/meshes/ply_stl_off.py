@@ -276,7 +276,8 @@ def submesh(mesh: Mesh, label: int) -> Mesh:
     used, index = np.unique(mesh.faces[keep], return_inverse=True)
     faces = index.reshape(-1, 3).astype(np.int32)
     detail = None if mesh.detail is None or (mesh.detail[used] == 1).all() else mesh.detail[used]
-    return Mesh(mesh.vertices[used], faces, mesh.normals[used], mesh.face_label[keep], mesh.open, detail)
+    uv = None if mesh.uv is None else mesh.uv[used]
+    return Mesh(mesh.vertices[used], faces, mesh.normals[used], mesh.face_label[keep], mesh.open, detail, uv)
 
 
 def read_stl(path: Path, content: bytes, limits: Limits) -> TriangleSoup:

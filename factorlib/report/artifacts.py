@@ -14,7 +14,7 @@ from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.reading import check_plain
 from factorlib.results.exchange import Exchange, read_exchange
 from factorlib.results.materials import Channels as Factors
-from factorlib.results.materials import MaterialTable, SolvedMaterial, read_exposures, read_materials
+from factorlib.results.materials import MaterialTable, read_exposures, read_materials
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -115,9 +115,9 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         return self.read(read_materials, "solve", "materials.json") or MaterialTable({})
 
     @cached_property
-    def materials(self) -> dict[str, SolvedMaterial]:
-        """The materials of materials.json, in the gauge of the exported lights; the page shows no others."""
-        return (self.read(read_materials, "export", "materials.json") or MaterialTable({})).materials
+    def exported(self) -> MaterialTable:
+        """The table of materials.json, in the gauge of the exported lights; without materials if there is no export."""
+        return self.read(read_materials, "export", "materials.json") or MaterialTable({})
 
     @cached_property
     def exposures(self) -> dict[str, Factors]:

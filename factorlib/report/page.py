@@ -136,6 +136,7 @@ def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
         errors={name: errors[name] for name in run.set.photos if name in errors},
         poses={name: poses[name] for name in run.set.photos if name in poses},
         low_iou=LOW_IOU,
+        paint={name: each.above for name, each in (run.exported.gauge.paint or {}).items()},
         lights=len(run.illuminations()),
         pixels={name: sum(photo.pixels.get(name, 0) for photo in facts) for name in run.set.materials},
     )
@@ -162,7 +163,7 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
 
 def _materials(run: Artifacts, cells: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Return the table's row of each solved material; its ball is in the light of the photo that shows it most."""
-    materials = run.materials
+    materials = run.exported.materials
     facts = run.photo_facts
     rows = []
     for name, row in zip(run.set.materials, cells, strict=True):

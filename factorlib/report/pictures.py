@@ -111,7 +111,7 @@ class PhotoRow(msgspec.Struct, frozen=True):
 
 def material_tags(run: Artifacts) -> dict[str, str]:
     """Return a colour "#rrggbb" for each material of the set, near its diffuse colour, or a metal's specular colour."""
-    reflectances = [run.materials.get(name, UNKNOWN) for name in run.set.materials]
+    reflectances = [run.exported.materials.get(name, UNKNOWN) for name in run.set.materials]
     colours = [np.add(m.diffuse, np.multiply(0.15, m.specular)) for m in reflectances]
     return nearest_tags(run.set.materials, np.array(colours))
 

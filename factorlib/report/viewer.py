@@ -64,7 +64,7 @@ def viewer_data(
         exposure: display exposure of each photo
     """
     lobes = run.read(read_lobes, "export", "lobes.parquet")
-    table = run.materials
+    table = run.exported.materials
     materials = {name: table[name].reflectance for name in run.set.materials if name in table}
     if not lobes or not materials:
         return None
@@ -119,7 +119,7 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
     parts = {name: dict(sorted(read_parts_of_glb(file).items())) for name, file in files.items()}
     loaded = {name: trimesh.load_scene(file, process=False).geometry for name, file in files.items()}
     for name, geometry in loaded.items():
-        _set_paint(geometry, parts[name], run.materials)
+        _set_paint(geometry, parts[name], run.exported.materials)
     entries = _viewed_objects(run, objects, files)
     kinds = sorted({(each.mesh, each.scale) for each in entries})
     triangles = sum(len(part.faces) for name, _ in kinds for part in loaded[name].values())

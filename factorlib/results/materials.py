@@ -102,6 +102,18 @@ class SolvedMaterial(Reflectance, frozen=True):
         return Reflectance(self.diffuse, self.specular, self.roughness)
 
 
+class PaintRange(msgspec.Struct, frozen=True):
+    """Brightest paint of a material, as it was estimated.
+
+    Attributes:
+        brightest: k_d times the factor plus max k_s, which all but a thousandth of the painted surface is below
+        above: share of the painted surface where that sum exceeds 1
+    """
+
+    brightest: AtLeast0
+    above: Share
+
+
 class Gauge(msgspec.Struct, frozen=True):
     """Rule that fixed the factor per channel that the observations leave free.
 
@@ -110,6 +122,7 @@ class Gauge(msgspec.Struct, frozen=True):
         stderr: gauge of the standard errors
         export_factor: factor of `export` on all reflectances
         export_rule: reason of that factor
+        paint: paint that reflects more than it receives, by material, before the factor
     """
 
     rule: str = ""
@@ -117,6 +130,7 @@ class Gauge(msgspec.Struct, frozen=True):
     stderr: str = ""
     export_factor: Positive | UnsetType = UNSET
     export_rule: str | UnsetType = UNSET
+    paint: dict[str, PaintRange] | UnsetType = UNSET
 
 
 class Tone(msgspec.Struct, frozen=True):

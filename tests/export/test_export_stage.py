@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.export import other_renderers
-from factorlib.export.gltf_writer import read_parts_of_glb, write_glb
+from factorlib.export.gltf_writer import EXTENSION, gltf_material, read_parts_of_glb, write_glb
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge
 from factorlib.export.other_renderers import Angles, distribution
@@ -191,9 +191,7 @@ def test_materialx_is_valid_where_its_library_is_there():
     document, standard = library.createDocument(), library.createDocument()
     library.loadLibraries(library.getDefaultDataLibraryFolders(), library.getDefaultDataSearchPath(), standard)
     document.importLibrary(standard)
-    library.readFromXmlString(
-        document, materialx(CASES, {"scenes/meshes/a.bright.png": "bright", "b.metal.png": "metal"})
-    )
+    library.readFromXmlString(document, materialx(CASES, {"scenes/meshes/a.png": ["bright"], "b.png": ["metal"]}))
     assert document.validate() == (True, "")
 
 
@@ -213,10 +211,33 @@ def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
             assert core["metallicFactor"] == 1 and core["baseColorFactor"] == [*material.specular, 1]
             continue
         more = entry["extensions"]["KHR_materials_specular"]
-        f0 = 0.04 * np.array(more["specularColorFactor"]) * more["specularFactor"]
-        np.testing.assert_allclose(f0, material.specular, atol=1e-12)
-        np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)
+        f0 = 0.04 * np.array(more["specularColorFactor"])
+        np.testing.assert_allclose(f0 + 1 / 75, material.specular, atol=1e-12)
+        assert more["specularFactor"] == 1
+        base = np.array(core["baseColorFactor"][:3])
+        np.testing.assert_allclose(base * (1 - max(material.specular)), material.diffuse, atol=1e-12)
         assert core["metallicFactor"] == 0
+
+
+def test_values_are_in_gltfs_ranges_and_viewers_without_the_extension_show_common_materials_alike():
+    """F0 rises steadily with k_s; plastics around an index of refraction of 1.5, and metals, differ by under a tenth."""
+    rng, last = np.random.default_rng(0), 0.0
+    for k_s in np.linspace(0.001, 0.09, 30):
+        specular = gltf_material(Reflectance((0.5, 0.4, 0.3), (k_s,) * 3, 0.4))["extensions"][EXTENSION]
+        assert specular["specularFactor"] == 1 and last < specular["specularColorFactor"][0] <= 2
+        last = specular["specularColorFactor"][0]
+    for _ in range(100):
+        share, diffuse, specular = rng.uniform(0, 0.99, 1), rng.uniform(0, 1, 3), rng.uniform(0, 1, 3)
+        entry = gltf_material(Reflectance(tuple((1 - share) * diffuse), tuple(share * specular), rng.uniform()))
+        core, more = entry["pbrMetallicRoughness"], entry.get("extensions", {}).get(EXTENSION)
+        values = [*core["baseColorFactor"], core["metallicFactor"], core["roughnessFactor"]]
+        assert 0 <= min(values) and max(values) <= 1
+        assert more is None or (0 <= 0.04 * max(more["specularColorFactor"]) <= 1 and 0 <= more["specularFactor"] <= 1)
+    plastics = [Reflectance((0.6, 0.3, 0.1), (k_s,) * 3, 0.4) for k_s in (0.045, 0.0533, 0.06)]
+    gold = Reflectance((0.05, 0.03, 0.01), (0.9, 0.7, 0.3), 0.3)
+    for material in (*plastics, gold):
+        shown = [other_renderers.ball_radiance(material, other_renderers.MODELS[n]) for n in ("glb", "glb_plain")]
+        assert np.linalg.norm(shown[1] - shown[0]) < 0.1 * np.linalg.norm(shown[0])
 
 
 def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
@@ -262,7 +283,8 @@ def test_every_variant_has_its_own_paint(tmp_path):
         uri = tree["images"][tree["textures"][core["baseColorTexture"]["index"]]["source"]]["uri"]
         with Image.open(BytesIO(base64.b64decode(uri.partition(",")[2]))) as image:
             shade = colours_at(np.asarray(image), part.visual.uv)
-        base = np.array(core["baseColorFactor"][:3]) * (1 - max(material.specular))
+        base = 1 - max(material.specular)
+        assert core["baseColorFactor"] == [1, 1, 1, 1]
         np.testing.assert_allclose(base * shade, each.detail[source] * material.diffuse, atol=0.005)
     assert "baseColorTexture" not in tree["materials"][2]["pbrMetallicRoughness"]
 

@@ -127,11 +127,11 @@ def test_detail_of_reflectance_is_a_factor_on_the_diffuse_part_in_scenes_that_ar
     halved = msgspec.structs.replace(material, diffuse=tuple(np.multiply(material.diffuse, SHADE).tolist()))
     half = rendered(ball_scene(folder, halved, light), spp=256)
     path = ball_scene(folder, material, light)
-    write_ply(folder / "painted.ply", ball, paint(material, detail))
-    path.write_text(path.read_text().replace("ball.red.ply", "painted.ply"))
+    write_ply(folder / "painted.vertices.ply", ball, paint(material, detail))
+    path.write_text(path.read_text().replace("ball.red.ply", "painted.vertices.ply"))
     plain = rendered(path, spp=256)  # colours that no material asks for change nothing
     np.testing.assert_allclose(plain[10:22, 10:22].mean((0, 1)), whole[10:22, 10:22].mean((0, 1)), rtol=0.01)
-    shape = ExportedShape("ball", "painted.ply", "red", PLACE, False, painted=True)
+    shape = ExportedShape("ball", "painted.ply", "red", PLACE, False, "painted.png")
     write_scene(path, ExportedScene(SQUARE, [shape], {"red": material}, ExposedMap("light.exr", np.ones(3), np.eye(3))))
     written = rendered(path, spp=256)
     placed = PlacedMesh(
