@@ -85,7 +85,7 @@ def mend_gaps(
     except InputError:  # `visual_hull` says what is wrong
         return mended, []
     origin, step, shape = grid_over(low, high, GRID_CELLS)
-    points = origin + step * np.indices(shape).reshape(3, -1).T
+    points = origin + step * np.indices(tuple(shape.tolist())).reshape(3, -1).T
     factors = [max(int(bounding_box(each.view.silhouette)[2]) // MASK_PIXELS, 1) for each in mended]
     small = [_sampled_down(each, factor) for each, factor in zip(mended, factors, strict=True)]
     distance = np.empty((len(small), len(points)), np.float32)

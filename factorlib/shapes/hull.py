@@ -105,7 +105,7 @@ def consensus_box(
     """
     middle, radius = _bounding_ball(outlines, dissenting)
     origin, step, shape = grid_over(middle - radius, middle + radius, COARSE_CELLS)
-    points = origin + step * np.indices(shape).reshape(3, -1).T
+    points = origin + step * np.indices(tuple(shape.tolist())).reshape(3, -1).T
     inside = points[signed_distance(outlines, points, dissenting) > -step]
     if not len(inside):
         raise InputError("no body fits into the outlines of most photos")
