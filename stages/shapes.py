@@ -24,6 +24,7 @@ from factorlib.jsonfile import write_json
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import pose_fields
 from factorlib.results.shape_table import FILE, ShapeEntry, ShapesTable
+from factorlib.shapes.gaps import mend_gaps
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.motion import PhotoForMotion, RegisteredCamera, cameras_by_motion
@@ -53,12 +54,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     first_share = 0.5 if slice_.sfm else 0.0
     part = (1 - first_share) / max(len(slice_.meshes), 1)
     shapes = {}
+    factors = {name: photo.facts.factor for name, photo in photos.items()}
     (out / "meshes").mkdir()
     for index, (name, entry) in enumerate(sorted(slice_.meshes.items())):
         outlines = [each for photo in photos.values() for each in photo.outlines(name, entry, cameras.get(photo.name))]
         outlines = [outline for outline in outlines if outline.is_visible]
+        share = _share(first_share + part * index, part, name, progress)
         try:
-            shape = estimate_shape(entry, outlines, params, _share(first_share + part * index, part, name, progress))
+            shape = estimate_shape(entry, outlines, params, share, factors)
         except InputError as error:
             raise InputError(error.fault, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_triangles(out / "meshes" / f"{name}.obj", shape, shape_parts(entry))
@@ -111,7 +114,11 @@ def shape_parts(entry: MeshEntry) -> list[str]:
 
 
 def estimate_shape(
-    entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]
+    entry: MeshEntry,
+    outlines: list[Outline],
+    params: Params,
+    report: Callable[[float], None],
+    factors: Mapping[str, int] = {},
 ) -> Triangles:
     """Return the shape of a mesh, estimated from its outlines.
 
@@ -120,6 +127,7 @@ def estimate_shape(
         outlines: Outlines of its objects in all photos.
         params: Parameters of the stage.
         report: Called with the completed share, from 0 to 1.
+        factors: Factor by which each photo was averaged down, for places in messages.
 
     Raises:
         InputError: If no photo shows the mesh.
@@ -136,7 +144,10 @@ def estimate_shape(
                 "a hull of %d outlines is larger than the body where no outline limits it: add photos from more sides",
                 len(posed),
             )
-        return visual_hull(posed, params.cells, len(shape_parts(entry)), report)
+        whole, gaps = mend_gaps(posed, lambda share: report(share / 2))
+        for gap in gaps:
+            log.warning("%s", gap.scaled(factors.get(gap.photo, 1)))
+        return visual_hull(whole, params.cells, len(shape_parts(entry)), lambda share: report((1 + share) / 2))
     if entry.lathe:
         shape = body_of_revolution(outlines, report)
         is_posed = any(outline.pose is not None for outline in outlines)

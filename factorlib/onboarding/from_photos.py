@@ -33,6 +33,7 @@ from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
 from factorlib.onboarding.parts import find_parts
 from factorlib.onboarding.photo_folder import Cameras
+from factorlib.shapes.gaps import mend_gaps
 from factorlib.shapes.hull import agreement, agreements, focal_by_hull, hull_box
 from factorlib.shapes.lathe import is_revolved
 from factorlib.shapes.motion import PhotoForMotion, cameras_by_motion
@@ -123,10 +124,12 @@ def dataset_from_photos(
         views, outlines = refine_masks(
             views, outlines, model, folder, lambda share, text: report(0.9 + share / 20, text)
         )
+        report(0.95, "gaps of the masks")
+        whole_outlines, gaps = mend_gaps(outlines)
         proposed = []
         if not (whole or meshes) and len(outlines) >= LEAST_VIEWS:
             proposed = label_parts(
-                outlines, {name: images[name] for name in visible}, folder,
+                whole_outlines, {name: images[name] for name in visible}, folder,
                 lambda share: report(0.95 + share / 20, "parts by colour"),
             )  # fmt: skip
         if unknown := not cameras.source and not meshes:
@@ -136,6 +139,7 @@ def dataset_from_photos(
         NAMES,
         *cameras.notes,
         *proposed,
+        *(str(gap.scaled(views[gap.photo].size[1] / views[gap.photo].small.camera.width)) for gap in gaps),
         *doubtful_masks(views, outlines),
     ]
 

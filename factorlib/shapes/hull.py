@@ -70,9 +70,7 @@ def visual_hull(
     high = middle + radius
     # sample f on a coarse grid to locate the body, then on a fine one about it
     for size in (COARSE_CELLS, cells):
-        step = float((high - low).max()) / size
-        shape = np.ceil((high - low) / step).astype(int) + 3
-        origin = (low + high) / 2 - step * (shape - 1) / 2
+        origin, step, shape = grid_over(low, high, size)
         field = _sample(outlines, origin, step, shape, report)
         least = -step if size == COARSE_CELLS != cells else 0  # the coarse grid also keeps parts thinner than a cell
         inside = np.argwhere(field > least)
@@ -86,6 +84,40 @@ def visual_hull(
         high = origin + step * (inside.max(axis=0) + 1)
     body = _smooth_mesh(field, origin, step, outlines)
     return msgspec.structs.replace(body, part=_vote_parts(body.vertices, body.faces, outlines, parts))
+
+
+def grid_over(
+    low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], cells: int
+) -> tuple[Float[np.ndarray, "3"], float, Int[np.ndarray, "3"]]:
+    """Return the first point, the step and the shape of a grid that exceeds a box, with so many cells along it."""
+    step = float((high - low).max()) / cells
+    shape = np.ceil((high - low) / step).astype(int) + 3
+    return (low + high) / 2 - step * (shape - 1) / 2, step, shape
+
+
+def consensus_box(
+    outlines: Sequence[Outline], dissenting: int
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Return the least and highest corner of the body that all but some outlines hold.
+
+    Raises:
+        InputError: There is none, all photos see the object from the same side, or one has it behind its camera.
+    """
+    middle, radius = _bounding_ball(outlines, dissenting)
+    origin, step, shape = grid_over(middle - radius, middle + radius, COARSE_CELLS)
+    points = origin + step * np.indices(tuple(shape.tolist())).reshape(3, -1).T
+    inside = points[signed_distance(outlines, points, dissenting) > -step]
+    if not len(inside):
+        raise InputError("no body fits into the outlines of most photos")
+    return inside.min(axis=0) - step, inside.max(axis=0) + step
+
+
+def hull_surface(field: Float[np.ndarray, "x y z"], step: float) -> tuple[Points, Int[np.ndarray, "f 3"]]:
+    """Mesh the surface f = 0 of a sampled field in grid units; there are no faces if nothing is inside."""
+    if not (field > 0).any():
+        return np.empty((0, 3)), np.empty((0, 3), int)
+    vertices, faces = surface_nets(fill_ambiguous(np.pad(field, 1, constant_values=-step)))
+    return vertices - 1, faces
 
 
 def _smooth_mesh(
@@ -102,9 +134,8 @@ def _smooth_mesh(
     Returns:
         The mesh with its overlap.
     """
-    vertices, faces = surface_nets(fill_ambiguous(np.pad(field, 1, constant_values=-step)))
-    vertices, faces = _remove_small_pieces(vertices, faces)
-    mesh = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False)
+    vertices, faces = _remove_small_pieces(*hull_surface(field, step))
+    mesh = trimesh.Trimesh(origin + step * vertices, faces, process=False)
     smoothed = []
     for more in np.diff(SMOOTHINGS, prepend=0):
         trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
