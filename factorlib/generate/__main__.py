@@ -3,8 +3,6 @@
 It writes the data sets in the repository, or others of the same protocol.
 """
 
-from collections.abc import Callable
-from inspect import Signature, signature
 from pathlib import Path
 from shutil import rmtree
 from types import ModuleType
@@ -23,81 +21,34 @@ Seed = Annotated[
     int, typer.Option(min=0, help="0 is the set the project carries; others have other materials, views and lights.")
 ]
 EXACT = typer.Option("--exact", help="Give the photographed mesh, its poses and focal lengths.")
-DISTANT = typer.Option("--distant", help="Light the chairs by the light's map alone, infinitely far away.")
-ROUGH = typer.Option(
-    "--rough",
-    metavar="TRIANGLES,WARP",
-    help="Give a worse mesh: triangles a part, and a bend as a share of its extent.",
-)
-DIRECT = typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")
 PAINTED = typer.Option("--painted", help="Paint wood and two shells: grain, a print, a patina; with true albedo.")
 Out = Annotated[Path | None, typer.Option(help="Folder to write; default data/<set>. It is replaced.")]
 Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .exr maps to light the set with.")]
 
 
-def writes_set(options: Callable[..., tuple[ModuleType, msgspec.Struct]]) -> Callable[..., None]:
-    """Return the command that writes a set, with --seed, --out and --lights beside its own options.
-
-    `options` takes the options of one command and returns the module of its set and the set's options.  The command
-    demands --out if one of them is given, because data/<set> has none.
-    """
-
-    def command(seed: Seed = 0, out: Out = None, lights: Lights = None, **values: bool | str | None) -> None:
-        """Write the set."""
-        if any(values.values()) and out is None:
-            *most, last = (f"--{name}" for name in values)
-            raise typer.BadParameter(
-                f"data/{options.__name__} is the set without {', '.join(most)} and {last}: name another folder",
-                param_hint="--out",
-            )
-        _write(*options(**values), out or Path("data", options.__name__), seed, lights)
-
-    shared = [each for each in signature(command).parameters.values() if each.kind is not each.VAR_KEYWORD]
-    command.__signature__ = Signature([*shared, *signature(options).parameters.values()])  # type: ignore[attr-defined]
-    command.__name__ = options.__name__
-    command.__doc__ = options.__doc__
-    return command
-
-
 @app.command()
-@writes_set
-def synthetic() -> tuple[ModuleType, msgspec.Struct]:
+def synthetic(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
     """Generate three materials in three lights on exact shapes, with direct light only."""
     from factorlib.generate import synthetic as set_
 
-    return set_, set_.SyntheticOptions()
+    _write(set_, set_.SyntheticOptions(), out or Path("data/synthetic"), seed, lights)
 
 
 @app.command()
-@writes_set
 def eames(
+    seed: Seed = 0,
+    out: Out = None,
+    lights: Lights = None,
     exact: Annotated[bool, EXACT] = False,
-    distant: Annotated[bool, DISTANT] = False,
-    direct: Annotated[bool, DIRECT] = False,
-    rough: Annotated[str | None, ROUGH] = None,
     painted: Annotated[bool, PAINTED] = False,
-) -> tuple[ModuleType, msgspec.Struct]:
+) -> None:
     """Generate six photos of moulded side chairs, path-traced with all bounces, on an approximate mesh."""
     from factorlib.generate import eames as set_
 
-    return set_, set_.ChairSetOptions(
-        exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact), painted=painted
-    )
-
-
-def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
-    """Parse TRIANGLES,WARP."""
-    if words is None:
-        return None
-    try:
-        triangles, warp = words.split(",")
-        numbers = int(triangles), float(warp)
-    except ValueError:
-        numbers = 0, 0.0
-    if exact or not (numbers[0] >= 20 and 0 <= numbers[1] <= 0.2):
-        expected = "without --exact, 20 triangles or more and 0 to .2, as in --rough 500,.02"
-        raise typer.BadParameter(expected, param_hint=f"--rough {words}")
-    return numbers
+    if (exact or painted) and out is None:
+        fault = "data/eames is the set without --exact and --painted: name another folder"
+        raise typer.BadParameter(fault, param_hint="--out")
+    _write(set_, set_.ChairSetOptions(exact=exact, painted=painted), out or Path("data/eames"), seed, lights)
 
 
 def _write(set_: ModuleType, parameters: msgspec.Struct, out: Path, seed: int, lights: Path | None) -> None:
