@@ -63,7 +63,7 @@ def test_what_one_checkout_makes_the_other_has(tmp_path, one, capsys):
     assert make(other) == 0 and computed(other) == 0
     assert files_of(other.build / "set" / "total") == files_of(one.build / "set" / "total")
     assert set(state(other).values()) == {"current"} and verify(other, None) == 0
-    verbs.show_logs(other, verbs.Request("set"), None)
+    verbs.show_logs(other, verbs.Request("set"))
     assert "MB peak" in capsys.readouterr().out, "what it cost is known here too"
 
 
