@@ -4,8 +4,6 @@
 has the value of an environment variable, by which make passes NAME=value on without a shell.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io

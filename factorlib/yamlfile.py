@@ -5,8 +5,6 @@ Nesting, growth through aliases and size have limits, so that an error comes bef
 msgspec converts the value to its type, whose `Meta` states the valid numbers or names and the cure for others.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import count

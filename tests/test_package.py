@@ -1,7 +1,5 @@
 """A Python package like any other: what it imports is declared, the lock follows from that, a wheel of it works by itself."""
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """State of a dataset before a run: each step's record, from the sources, the dataset and the installed packages."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

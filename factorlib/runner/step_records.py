@@ -1,7 +1,5 @@
 """Record of each step: everything that its key is the hash of, but for the results of other steps."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

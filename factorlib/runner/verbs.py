@@ -1,7 +1,5 @@
 """Verbs of the command line.  Each shows or runs the same plan, and returns the exit code."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import inspect

@@ -10,8 +10,6 @@ None looks the same from two sides. But a smooth body of one material and its mi
 seen from opposite sides from far away, so a mirrored mask of the first three is hard to tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

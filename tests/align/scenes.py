@@ -1,7 +1,5 @@
 """Meshes and photos of known pose for the tests of alignment."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
