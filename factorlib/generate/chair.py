@@ -3,7 +3,7 @@
 Object frame: metres, y up, the floor at y = 0, the sitter looks along +z. The chair has the proportions of the
 well-known one (47 cm wide at the feet, 52 cm deep, 82 cm high), by formulas of our own. `chair` is the object that is
 rendered. `rough_chair` is a mesh that a user might have of it: fewer, flatter faces, thicker legs, and errors of a few
-millimetres everywhere. `bent_chair` is a worse one.
+millimetres everywhere. `bend_parts` makes worse ones.
 """
 
 from collections.abc import Sequence
@@ -57,11 +57,6 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
 
     parts = {"shell": shell(14, 22), "legs": legs(7, 3, radii=DIMENSIONS.rough_leg_radii)}
     return {name: (v + np.sin(v @ axes.T + phases.T) @ shifts, faces) for name, (v, faces) in parts.items()}
-
-
-def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
-    """Return shell and legs, decimated and bent as by `bend_parts`."""
-    return bend_parts(chair(), rng, triangles, warp)
 
 
 def bend_parts(parts: dict[str, Part], rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
