@@ -81,12 +81,17 @@ def bend_parts(parts: dict[str, Part], rng: np.random.Generator, triangles: int,
     deviation = float(np.sqrt(np.square(waves - waves.mean(axis=0)).sum(axis=1).mean()))
     bent = {}
     for name, (vertices, faces) in parts.items():
-        mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
-        fewer = mesh.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
-        places = np.asarray(fewer.vertices)
+        places, fewer = decimate(vertices, faces, triangles)
         shift = (np.sin(places @ axes.T + phases.T) @ shifts - middle) * warp * extent / (2 * deviation)
-        bent[name] = places + shift, np.asarray(fewer.triangles)
+        bent[name] = places + shift, fewer
     return bent
+
+
+def decimate(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> Part:
+    """Decimate a part to about so many triangles, by Open3D's quadric error metrics (Garland and Heckbert 1997)."""
+    whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
+    few = whole.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
+    return np.asarray(few.vertices), np.asarray(few.triangles)
 
 
 def label_parts(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
