@@ -14,14 +14,12 @@ MAKEFLAGS += --no-print-directory
 .PHONY: all plan why status graph logs params new photos label compare validate verify clean gc pack setup lock test check-types run-tests test-long docs results study studies data help help-all $(STAGES)
 
 # each reads DATASET, SET, HELD_OUT and FORCE from the environment
-all plan why status graph logs params new photos label compare validate verify pack $(STAGES): .venv/ready
+all plan why status graph logs params new photos label compare validate verify gc pack $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 clean: .venv/ready
-	@if [ -n "$$STUDY" ]; then $(PY) -m studies --one --clean; else $(PY) -m factorlib clean; fi
-
-gc: .venv/ready
-	@$(PY) -m factorlib gc && $(PY) -m studies --gc
+	@[ -z "$$STUDY" ] || { echo "error: STUDY: clean deletes results of datasets; those of studies: rm -r build/studies" >&2; exit 1; }
+	@$(PY) -m factorlib clean
 
 setup: .venv/ready
 	@[ -z "$$EXTRAS" ] || $(PY) -I factorlib/setup.py extras
@@ -89,21 +87,21 @@ help-all:
 	@echo 'make photos DATASET=mychair PHOTOS=… [MESHES=…] [MATTE=<file.onnx>] [WHOLE=1]   the same with automatic masks, cameras and a hull'
 	@echo 'make label DATASET=mychair [PORT=…]   draw masks in a browser: boxes, clicks, brush (docs/dataset.md)'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
-	@echo 'make logs DATASET=… STAGE=… PHOTO=…  time, peak memory, versions and warnings of results'
-	@echo 'make graph                           the stages and their inputs; $(PY) -m factorlib graph --mermaid: as a diagram'
+	@echo 'make logs DATASET=… STAGE=…           time, peak memory, versions and warnings of results'
+	@echo 'make graph                           the stages and their inputs'
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
 	@echo 'make pack DATASET=… OUT=x.zip         a result as one file that travels: report, exports, meshes, lights, frames and units'
 	@echo 'make verify [DATASET=…]              read every stored result and list damaged ones; the next run that needs one makes it again'
-	@echo 'make clean [DATASET=… | STUDY=…]     remove the results of a dataset, of all datasets, or of a study (QUICK=1: its quick ones)'
-	@echo 'make gc                              list results that no dataset or study uses, and delete them (FORCE=1: without asking)'
+	@echo 'make clean [DATASET=…]               remove the results of a dataset, or of all; those of studies: rm -r build/studies'
+	@echo 'make gc                              list results that no dataset uses, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, types, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
 	@echo 'make docs                            docs/ and the library as a site, to build/docs/index.html'
 	@echo 'make results [ONLY=operator]          measure what docs/results.md shows, all of it (hours) or one section, and write it there;'
 	@echo '                                      ONLY=gallery | notebook: docs/gallery.md, docs/result.ipynb (EXTRAS=notebook)'
 	@echo 'make study STUDY=matrix-size         an experiment: table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
-	@echo 'make studies                         all experiments, and one page of them: build/studies/index.md (docs/studies.md)'
+	@echo 'make studies                         all experiments (docs/studies.md)'
 	@echo 'make data                            make data/ again'
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'

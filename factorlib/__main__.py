@@ -4,8 +4,6 @@
 has the value of an environment variable, by which make passes NAME=value on without a shell.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io
@@ -27,23 +25,14 @@ from factorlib.runner.display import printable, printable_streams
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.wholefile import disk_error
 
-SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
-
 
 def project() -> Project:
-    """Return the project: the checkout of FACTORLIB_ROOT, of this package, or of the current folder.
-
-    Without a checkout, it is the current folder with the pipeline that pip installed with the package.
-    """
-    cwd = Path.cwd()
-    checkout = next((folder for folder in (LIBRARY, cwd, *cwd.parents) if (folder / PIPELINE).is_file()), None)
-    if not (root := os.environ.get("FACTORLIB_ROOT") or checkout):
-        for shipped in (folder / SHIPPED for folder in (LIBRARY, *LIBRARY.parents)):
-            if (shipped / PIPELINE).is_file():
-                return Project(cwd, photo_sets(), shipped=shipped)
+    """Return the project: the checkout of FACTORLIB_ROOT, or that of this package; InputError if there is none."""
+    root = Path(os.environ.get("FACTORLIB_ROOT") or LIBRARY).resolve()
+    if not (root / PIPELINE).is_file():
         cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<folder with {PIPELINE}, stages and data>"
-        raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=cwd, cure=cure)
-    return Project(Path(root).resolve(), photo_sets())
+        raise InputError(f"this folder has no {PIPELINE}", file=root, cure=cure)
+    return Project(root, photo_sets())
 
 
 def dataset_of(arguments: Namespace) -> str:
@@ -94,7 +83,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "PHOTO,PHOTO",
         "help": "photos that this run predicts and does not solve from",
     },
-    "--photo": {"key": "PHOTO", "help": "name of a photo or a recipe"},
     "--photos": {"key": "PHOTOS", "type": _path, "help": "folder of photos"},
     "--masks": {"key": "MASKS", "type": _path, "help": "folder of masks"},
     "--meshes": {"key": "MESHES", "type": _path, "help": "folder of meshes"},
@@ -107,7 +95,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--port": {"key": "PORT", "type": int, "help": "port on 127.0.0.1, otherwise a free one"},
     "--out": {"key": "OUT", "type": _path, "help": "zip file to write, otherwise <dataset>.zip in this folder"},
     "--sheet": {"key": "SHEET", "action": "store_true", "help": "also draw photos, labels and meshes"},
-    "--mermaid": {"action": "store_true", "help": "print a Mermaid diagram"},
     "stages": {"key": "STAGE", "nargs": "*", "help": "stages; otherwise all"},
     "first": {"key": "A", "type": _path, "nargs": "?", "help": "folder of a result, such as build/eames"},
     "second": {"key": "B", "type": _path, "nargs": "?", "help": "folder of another result"},
@@ -153,10 +140,9 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
     "status": ("stages --dataset --set --recipe --held-out",
                lambda a: verbs.show_status(project(), request(a, a.stages)),
                "Print the progress of each stage, and the warnings of current results."),
-    "graph": ("--mermaid --dataset", lambda a: verbs.show_graph(project(), a.mermaid),
-              "Print the stages and their inputs, as text or as a Mermaid diagram."),
-    "logs": ("stages --dataset --set --recipe --held-out --photo",
-             lambda a: verbs.show_logs(project(), request(a, a.stages), a.photo),
+    "graph": ("--dataset", lambda a: verbs.show_graph(project()), "Print the stages and their inputs."),
+    "logs": ("stages --dataset --set --recipe --held-out",
+             lambda a: verbs.show_logs(project(), request(a, a.stages)),
              "Print time, memory and package versions of current results."),
     "params": ("stages", lambda a: verbs.show_params(project(), a.stages),
                "List the parameters of stages with default, range and meaning (make params STAGE=…)."),
@@ -185,7 +171,7 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
 }  # fmt: skip
 
 
-def dispatch(words: list[str], program: str) -> int:
+def dispatch(words: list[str]) -> int:
     """Run the verb of the command line and return its exit code.
 
     A first word that is neither an option nor a verb is a stage.
@@ -193,7 +179,7 @@ def dispatch(words: list[str], program: str) -> int:
     if words and not words[0].startswith("-") and words[0] not in VERBS:
         words = ["stage", *words]
     epilog = "Any other word is the name of a stage: it is run with the stages that it needs."
-    parser = argparse.ArgumentParser(program, description=epilog)
+    parser = argparse.ArgumentParser("python -m factorlib", description=epilog)
     parsers = parser.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
     for name, (options, _, text) in VERBS.items():
         verb = parsers.add_parser(name, help=text, description=text, allow_abbrev=False)
@@ -229,9 +215,7 @@ def main() -> NoReturn:
     try:
         with printable_streams(), raise_on_signals():
             logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
-            sys.exit(
-                dispatch(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib")
-            )
+            sys.exit(dispatch(sys.argv[1:]))
     except InputError as error:
         sys.exit(printable(f"error: {error}"))
     except BrokenPipeError:  # The reader, such as `head`, has closed the pipe.

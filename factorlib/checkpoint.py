@@ -4,8 +4,6 @@ A resumed computation must end in the same bytes as an uninterrupted one.  A che
 the unknowns, the optimiser's memory, the random generator's state and the progress.
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import pickle

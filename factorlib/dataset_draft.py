@@ -147,7 +147,7 @@ def new_dataset(
     sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
     sources["cameras"] = cameras.folder, cameras.files
     places = {name: (folder, files) for name, (folder, files) in sources.items() if folder}
-    _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
+    _match(spec, labelled, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     _write(target, spec, places, above)
     return missing
 
@@ -221,7 +221,12 @@ def _photo_entries(
             only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
             mesh_of = {name: (_meshes_named_in(name, entries) or [only])[0] for name in silhouettes}
             objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes.items()]
-        entry = {"name": photo, "image": path, "masks": labelled.by_photo.get(photo, UNKNOWN), "objects": objects}
+        entry = {
+            "name": photo,
+            "image": path,
+            "masks": labelled.by_photo.get(photo, f"masks/{photo}.png"),
+            "objects": objects,
+        }
         photos.append(entry | cameras.by_photo.get(photo, {}))
     return photos
 
@@ -412,7 +417,7 @@ def _meshes(folder: Path, files: list[Path], materials: list[str]) -> dict[str, 
     return entries
 
 
-def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
+def _match(spec: dict, labelled: Masks, file: Callable[[str], Path], missing: list[str]) -> None:
     """Write the material of each open part as the masks suggest it, in the mesh or, if it differs, in an object.
 
     `file` returns the present path of a file that is to be copied.
@@ -426,7 +431,7 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
             continue
         for photo, obj in [(p, obj) for p in spec["photos"] for obj in p["objects"] if obj["mesh"] == name]:
             is_separate = "mask" in obj or len(photo["objects"]) == 1
-            if is_separate and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
+            if is_separate and photo["name"] in labelled.by_photo and len(objects) < MOST_OBJECTS:
                 with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
                     objects.append((photo["name"], obj, _silhouette(photo, obj, materials, file)))
         mesh = read_mesh(file(entry["file"]), list(part_materials), {part: part for part in part_materials})

@@ -4,8 +4,6 @@ Anything wrong with a user's files or words is an `InputError`.  It states the f
 other exception is a defect of this project.
 """
 
-from __future__ import annotations
-
 import unicodedata
 from collections.abc import Iterable
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """JSON on disk: sorted keys, shortest round-trip floats, no NaN, so that equal values are equal bytes."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

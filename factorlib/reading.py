@@ -9,8 +9,6 @@
 Keep the `with` narrow, because it would blame the file for a defect of this project.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

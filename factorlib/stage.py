@@ -4,8 +4,6 @@ A stage is a module `stages/<name>.py` with a frozen `Params` struct and `main(p
 not know where the store is or whether it runs in a pool.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable

@@ -4,8 +4,6 @@ Python raises the errors of `write` and `close`.  A library that ignores them mu
 and return the bytes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -5,8 +5,6 @@ Nesting, growth through aliases and size have limits, so that an error comes bef
 msgspec converts the value to its type, whose `Meta` states the valid numbers or names and the cure for others.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import count
@@ -322,17 +320,3 @@ def yaml_text(value: Any) -> str:
           e: "1"
     """
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False, width=10**6)
-
-
-def with_value(text: str, keys: Keys, word: str) -> str:
-    """Return the text with the value at `keys`, which must exist, replaced; every other character is unchanged.
-
-    Args:
-        text: the YAML text
-        keys: path to the value
-        word: the new value, as written
-    """
-    node = yaml.compose(text, Loader=_Loader)
-    for key in keys:
-        node = node.value[key] if isinstance(key, int) else next(item for name, item in node.value if name.value == key)
-    return text[: node.start_mark.index] + word + text[node.end_mark.index :]

@@ -1,8 +1,7 @@
 """Command line of the studies: `python -m studies [study …] [--quick]`; all studies without a name.
 
 Make passes STUDY, QUICK and FORCE on.
-With --docs the tables of docs/studies.md are written anew afterwards; with --clean the results of studies are
-forgotten, with --gc those that no study names any more are deleted, quick ones among them.
+With --docs the tables of docs/studies.md are written anew afterwards.
 """
 
 import os
@@ -11,11 +10,11 @@ from typing import Annotated
 
 import typer
 
-from factorlib.__main__ import confirm, raise_on_signals, switched_on
+from factorlib.__main__ import raise_on_signals, switched_on
 from factorlib.errors import InputError, did_you_mean
 from factorlib.wholefile import disk_error
 from studies.catalogue import STUDIES
-from studies.run import collect, forget, make, studies
+from studies.run import make, studies
 from studies.study import FULL, QUICK
 
 
@@ -26,20 +25,14 @@ def study_command(
     docs: Annotated[
         bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew, of full studies")
     ] = False,
-    clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
-    gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
     """Run the steps of studies that are not current, or all with FORCE=1; SET="executor=tcp://…" names the executor."""
-    if gc:
-        raise typer.Exit(collect(lambda: confirm(False)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
     scale = QUICK if switched_on("QUICK", quick) else FULL
     for name in named:
         studies(scale).dataset_folder(name)
-    if clean:
-        raise typer.Exit(forget(scale, named or list(STUDIES)))
     code = make(scale, named or list(STUDIES), switched_on("FORCE", False), [os.environ.get("SET", "")])
     if docs and code == 0 and not scale.quick:
         from studies.run.tables import refresh_docs

@@ -6,8 +6,6 @@ Difference  of two settings, seed by seed, because a seed shows the same materia
             together (Bonferroni: each at 1 − .05 / comparisons), over at least `LEAST_SEEDS`.
 """
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 
 import msgspec
@@ -136,11 +134,6 @@ class Cell(msgspec.Struct, frozen=True):
     values: dict[int, float]
     nulls: dict[int, float] = {}
 
-    @property
-    def null(self) -> float | None:
-        """Mean over seeds of a guess's scores."""
-        return sum(self.nulls.values()) / len(self.nulls) if self.nulls else None
-
     def __str__(self) -> str:
         """Return the mean and the half width of its interval.
 
@@ -247,34 +240,6 @@ def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int) -> ClaimOu
 
 
 # ── as text ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-COLUMNS = (
-    "study",
-    "setting",
-    "label",
-    "measure",
-    "unit",
-    "seeds",
-    "mean",
-    "deviation",
-    "low_95",
-    "high_95",
-    "null_mean",
-)
-
-
-def csv_text(table: Conclusion) -> str:
-    """Format a line for each setting and measure."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in table.rows:
-        for measure, cell in row.cells.items():
-            s = cell.spread
-            numbers = ("" if v is None else f"{v:.6g}" for v in (s.mean, s.deviation, s.low, s.high, cell.null))
-            unit = MEASURES[measure].partition("|")[2]
-            writer.writerow([table.study, row.name, row.label, measure, unit, s.seeds, *numbers])
-    return text.getvalue()
 
 
 def paragraph(table: Conclusion) -> str:

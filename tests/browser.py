@@ -3,8 +3,6 @@
 Error: |viewer − operator| / max over channels of the operator's.
 """
 
-from __future__ import annotations
-
 import atexit
 import shutil
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The layers of the code: what must start quickly loads no science, and the runner finds what every stage imports."""
+"""The layers of the code: what must start quickly loads no science."""
 
 import subprocess
 import sys
@@ -24,16 +24,3 @@ def test_what_must_start_quickly_loads_nothing_heavy(code, heavy):
     code = f"import sys; {code}; sys.exit(', '.join({heavy!r} & set(sys.modules)) or 0)"
     process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr
-
-
-def test_every_stage_of_the_pipeline_has_its_module_and_the_runner_finds_what_it_imports():
-    from factorlib.runner.closure import Sources
-    from factorlib.runner.project import photo_sets, read_pipeline
-    from factorlib.runner.store import FileHashes
-
-    pipeline = read_pipeline(ROOT / "pipeline.yaml", photo_sets().slices)
-    sources = Sources([ROOT], FileHashes(None))
-    for name in pipeline.stages:
-        closure = sources.closure("stages", name, ROOT / "pipeline.yaml")
-        assert {f"source:stages.{name}", "source:factorlib.stage"} <= closure.record.keys()
-        assert not any(name.startswith("source:factorlib.runner") for name in closure.record)

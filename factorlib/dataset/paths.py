@@ -159,12 +159,10 @@ class Refusal:
                 names = [entry.name for entry in target.parent.iterdir() if entry.is_file()]
             except OSError:
                 names = []
-            suggestion = did_you_mean(target.name, names)
-            self(
-                key,
-                f"there is no file {path!r}",
-                (suggestion if suggestion.startswith("did") else f"put it at {target}, or correct the path"),
-            )
+            cure = did_you_mean(target.name, names)
+            if not cure.startswith("did"):
+                cure = f"put it at {target}, or correct the path" + "; `make label` draws it" * key.endswith(".masks")
+            self(key, f"there is no file {path!r}", cure)
 
     def check_subfolder(self, key: str, path: str) -> None:
         """Check that a path leads to a readable folder inside the dataset's, with links followed."""

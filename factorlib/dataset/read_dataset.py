@@ -152,7 +152,6 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     if places:
         number = f"{len(places)} places are" if len(places) > 1 else "one place is"
         cure = "write what belongs there, in place of `?`"
-        cure += "; `make label` draws masks" * any(place.endswith(".masks") for place in places)
         faults.append(InputError(f"{number} left open: {_enumerate(places)}", file=file, key=places[0], cure=cure))
     try:
         spec = convert(value, DatasetFile, file, text=text)

@@ -3,7 +3,7 @@
 Object frame: metres, y up, the floor at y = 0, the sitter looks along +z. The chair has the proportions of the
 well-known one (47 cm wide at the feet, 52 cm deep, 82 cm high), by formulas of our own. `chair` is the object that is
 rendered. `rough_chair` is a mesh that a user might have of it: fewer, flatter faces, thicker legs, and errors of a few
-millimetres everywhere. `bent_chair` is a worse one.
+millimetres everywhere. `bend_parts` makes worse ones.
 """
 
 from collections.abc import Sequence
@@ -59,11 +59,6 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
     return {name: (v + np.sin(v @ axes.T + phases.T) @ shifts, faces) for name, (v, faces) in parts.items()}
 
 
-def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
-    """Return shell and legs, decimated and bent as by `bend_parts`."""
-    return bend_parts(chair(), rng, triangles, warp)
-
-
 def bend_parts(parts: dict[str, Part], rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
     """Return the parts of a mesh, decimated and bent by four waves of about its length.
 
@@ -86,12 +81,17 @@ def bend_parts(parts: dict[str, Part], rng: np.random.Generator, triangles: int,
     deviation = float(np.sqrt(np.square(waves - waves.mean(axis=0)).sum(axis=1).mean()))
     bent = {}
     for name, (vertices, faces) in parts.items():
-        mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
-        fewer = mesh.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
-        places = np.asarray(fewer.vertices)
+        places, fewer = decimate(vertices, faces, triangles)
         shift = (np.sin(places @ axes.T + phases.T) @ shifts - middle) * warp * extent / (2 * deviation)
-        bent[name] = places + shift, np.asarray(fewer.triangles)
+        bent[name] = places + shift, fewer
     return bent
+
+
+def decimate(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> Part:
+    """Decimate a part to about so many triangles, by Open3D's quadric error metrics (Garland and Heckbert 1997)."""
+    whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
+    few = whole.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
+    return np.asarray(few.vertices), np.asarray(few.triangles)
 
 
 def label_parts(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:

@@ -2,8 +2,8 @@
 
 It is harder than the synthetic set in the ways of real photographs. Its JPEGs have clipped highlights. Its chairs
 shadow and reflect themselves, each other and the ground. Its mesh is coarser than the rendered chair and a few
-millimetres off. Poses, and half of the focal lengths, are unknown. Three difficulties can be removed one by one, to
-measure the cost of each: `exact` geometry, `distant` light, `direct` light. One can be added: `painted` materials.
+millimetres off. Poses, and half of the focal lengths, are unknown. With `exact` geometry it is easier, with `painted`
+materials harder.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, surroundings
-from factorlib.generate.chair import bent_chair, chair, label_parts, rough_chair
+from factorlib.generate.chair import chair, label_parts, rough_chair
 from factorlib.generate.paint import paint_mesh
 from factorlib.generate.surroundings import EYE, Rng, SceneDict, random_materials
 from factorlib.geometry.camera import Camera, Pose
@@ -35,7 +35,6 @@ from factorlib.tracing.scene import (
     rigid,
     sensor,
     shape,
-    transform,
 )
 from factorlib.yamlfile import read_yaml
 
@@ -53,9 +52,6 @@ class ChairSetOptions(msgspec.Struct, frozen=True):
     light_rows       rows of light maps
     spp, light_spp   samples per pixel of photos and of light maps
     exact            the data set has the rendered mesh, poses and focal lengths
-    distant          the light's map, infinitely far away, is the only light and surroundings of the chairs
-    direct           light is not reflected on its way: only emitters light the chairs
-    rough            the data set's mesh has this number of triangles a part, and is bent by this share of its extent
     painted          diffuse reflectance varies over wood and two of the shells (`factorlib.generate.paint`)
     """
 
@@ -65,9 +61,6 @@ class ChairSetOptions(msgspec.Struct, frozen=True):
     spp: int = 224
     light_spp: int = 24
     exact: bool = False
-    distant: bool = False
-    direct: bool = False
-    rough: tuple[int, float] | None = None
     painted: bool = False
 
 
@@ -131,8 +124,6 @@ def generate(
     materials = random_materials(rng, 0.2 * spread, SET.materials)
     rough = rough_chair(rng)
     exact = {name: smooth(*part) for name, part in chair().items()} if parameters.exact else {}
-    if parameters.rough:
-        rough = bent_chair(np.random.default_rng([13, seed]), *parameters.rough)
     parts = {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in exact.items()} or rough
     folder.write_obj(out / CHAIR["file"], parts)
     labels = {name: label for label, name in enumerate(materials, start=1)}
@@ -147,8 +138,7 @@ def generate(
         scene = arrange_scene(shot, number, lat_longs, rng, spread, parameters)
         poses[shot.name] = scene.poses
         photos.append(write_chair_shot(out, scene, materials, chairs, parameters, 1000 * seed + number))
-    options = "".join(f" --{name}" for name in ("exact", "distant", "direct", "painted") if getattr(parameters, name))
-    options += " --rough {},{}".format(*parameters.rough) if parameters.rough else ""
+    options = "".join(f" --{name}" for name in ("exact", "painted") if getattr(parameters, name))
     comment = f"Generated (rendered, not photographed): python -m factorlib.generate eames{options}"
     folder.write_records(out, comment, materials, {"chair": CHAIR}, photos, poses)
     progress(len(shots), len(shots), "done")
@@ -178,7 +168,7 @@ def arrange_scene(
 ) -> ChairScene:
     """Place camera, chairs and surroundings of a shot; nothing is between camera and chairs.
 
-    The surroundings are a sky, a room, or a user's map over a grey ground (without the ground if light is `distant`).
+    The surroundings are a sky, a room, or a user's map over a grey ground.
 
     Args:
         shot: The shot.
@@ -208,11 +198,8 @@ def arrange_scene(
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
     camera = Camera(width, height, folder.focal_px_of_35mm(shot.focal_35mm, width, height), (width / 2, height / 2))
     if lat_longs:
-        around = {
-            "light": envmap(surroundings.read_captured_light(lat_longs[number % len(lat_longs)], parameters.light_rows))
-        }
-        if not parameters.distant:
-            around["ground"] = surroundings.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))
+        light = surroundings.read_captured_light(lat_longs[number % len(lat_longs)], parameters.light_rows)
+        around = {"light": envmap(light), "ground": surroundings.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
     elif shot.sun:
         up, aside = shot.sun
         around = surroundings.daylight(rng, up, yaw + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
@@ -283,21 +270,16 @@ def render_shot(
         The light's map in the camera's y-up frame, and the photo's radiance.
     """
     around = scene.surroundings
-    # light that is direct but not distant is that of emitters alone
     world_from_light = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA
-    depth = 1 if parameters.direct and not parameters.distant else -1
     place = rigid(world_from_light, (0, SET.middle - EYE, 0))
-    light = incident_light(around, place, parameters.light_rows, parameters.light_spp, seed, depth)
-    if parameters.distant:
-        around = {"light": envmap(light) | {"to_world": transform(rigid(world_from_light, (0, 0, 0)))}}
+    light = incident_light(around, place, parameters.light_rows, parameters.light_spp, seed)
     solids = {
         f"{name}_{label}": _part(submesh(mesh, label), materials[label - 1], world_from_object)
         for mesh, (name, world_from_object) in zip(meshes, scene.chairs.items(), strict=True)
         for label in mesh.labels
     }
-    depth = 2 if parameters.direct else -1
     film = sensor(scene.camera, scene.world_from_camera)
-    return light, render_scene(around | solids, film, parameters.spp, seed, depth)
+    return light, render_scene(around | solids, film, parameters.spp, seed, max_depth=-1)
 
 
 def _part(mesh: Mesh, material: Reflectance, world_from_object: Float[np.ndarray, "4 4"]) -> Any:

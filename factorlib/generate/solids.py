@@ -63,7 +63,7 @@ def sphere(radius: float = 0.6) -> Mesh:
     return star(lambda direction: np.full(direction.shape[:-1], radius))
 
 
-def blob() -> Mesh:
+def blob(rows: int = ROWS, columns: int = COLUMNS) -> Mesh:
     """Return a smooth body without any symmetry: a ball with broad bumps of several heights."""
 
     def radius(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
@@ -74,13 +74,13 @@ def blob() -> Mesh:
             size += 0.45 * height * np.exp(sharpness * (direction @ axis - 1))
         return size
 
-    return star(radius)
+    return star(radius, rows, columns)
 
 
-def star(radius: Callable[[np.ndarray], np.ndarray]) -> Mesh:
+def star(radius: Callable[[np.ndarray], np.ndarray], rows: int = ROWS, columns: int = COLUMNS) -> Mesh:
     """Return the surface at distance `radius(direction [*n, 3]) -> [*n]` from the origin."""
-    theta = np.arange(1, ROWS) / ROWS * np.pi
-    phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    theta = np.arange(1, rows) / rows * np.pi
+    phi = np.arange(columns) / columns * 2 * np.pi
     sin = np.sin(theta)[:, None]
     direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
     poles = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])

@@ -10,8 +10,6 @@ float colours keeps its chromaticity. An EXR has the size of its display window.
 the picture that other programs show is read; Pillow decodes it, since OpenImageIO would apply the map.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import zlib

@@ -11,7 +11,6 @@ import io
 import re
 import secrets
 import sys
-from contextlib import suppress
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -28,7 +27,7 @@ from PIL import Image
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal, file_exists, path_on_disk
-from factorlib.dataset.read_dataset import FILE, UNKNOWN
+from factorlib.dataset.read_dataset import FILE
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
 from factorlib.images.photo import decode_photo, open_photo
@@ -36,9 +35,9 @@ from factorlib.images.picture import PALETTE, picture, png_bytes
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.labels.grow import grow
 from factorlib.labels.mask_files import read_values
-from factorlib.reading import read_bytes, read_text
+from factorlib.reading import read_bytes
 from factorlib.wholefile import replace_file
-from factorlib.yamlfile import parse_yaml, read_yaml, with_value
+from factorlib.yamlfile import read_yaml
 
 HEADERS = {
     "Cache-Control": "no-store",
@@ -56,9 +55,7 @@ class LabelledPhoto(msgspec.Struct, frozen=True):
     image: str
     masks: Annotated[
         str,
-        msgspec.Meta(
-            description='here one label PNG a photo is drawn: name it, also if it is not there yet, or write masks: "?"'
-        ),
+        msgspec.Meta(description="here one label PNG a photo is drawn: name it, also if it is not there yet"),
     ]
     encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
 
@@ -73,8 +70,7 @@ class LabelledSet(msgspec.Struct, frozen=True):
 class MaskSet:
     """The label masks of the photos of a data set.
 
-    A mask that does not exist yet is empty.  If dataset.yaml leaves it as `?`, it becomes masks/<photo>.png, and
-    dataset.yaml names it when it is saved.
+    A mask that does not exist yet is empty.
 
     Raises:
         InputError: dataset.yaml or a photo cannot be read, or a mask is not a label PNG.
@@ -94,7 +90,7 @@ class MaskSet:
         refuse.check_distinct("photos", (photo.name for photo in self.photos), "photo")
         for index, photo in enumerate(self.photos):
             key = f"photos[{index}].image"
-            mask = f"masks/{photo.name}.png" if photo.masks == UNKNOWN else path_on_disk(self.folder, photo.masks)
+            mask = path_on_disk(self.folder, photo.masks)
             refuse.check_path(key, photo.image, IMAGES)
             refuse.check_path(f"photos[{index}].masks", mask, (".png",), must_exist=False)
             self.files.append((self.folder / mask).resolve())
@@ -138,33 +134,9 @@ class MaskSet:
                 file=path,
                 cure="press R to read it (what was drawn since the last save is lost), or move the file away",
             )
-        named = self._named(self.photos[index].name)
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, png)
-        if named is not None:
-            replace_file(self.yaml, named.encode())
         return self.version(index)
-
-    def _named(self, photo: str) -> str | None:
-        """Return dataset.yaml with the mask's path in place of the photo's `?`, or None if there is no `?`."""
-        text = read_text(self.yaml, "a YAML file")
-        mask = f"masks/{photo}.png"
-        photos = [(each.name, each.masks) for each in read_yaml(self.yaml, LabelledSet).photos]
-        if (photo, UNKNOWN) not in photos:
-            return None
-        index = photos.index((photo, UNKNOWN))
-        value = parse_yaml(text)
-        text = with_value(text, ("photos", index, "masks"), mask)
-        value["photos"][index]["masks"] = mask
-        with suppress(InputError):  # The `?` had an anchor that other places refer to.
-            if parse_yaml(text) == value:
-                return text
-        raise InputError(
-            "its `?` has an anchor that other keys use, so it cannot be replaced automatically",
-            file=self.yaml,
-            key=f"photos[{index}].masks",
-            cure=f"write masks: {mask}, and save again; nothing was written",
-        )
 
     def version(self, index: int) -> str:
         """Return the hash of a mask's file, or NO_FILE if it does not exist."""

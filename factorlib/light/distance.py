@@ -11,8 +11,6 @@ A constant light therefore stays constant, and c = 0 is an environment map, infi
 sharpness.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

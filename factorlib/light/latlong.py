@@ -6,8 +6,6 @@ exact at any sharpness, and its exponential is an outer product over rows and co
 Gauss–Legendre nodes, as many as the lobe needs, and only where the lobe is not negligible.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -21,8 +21,6 @@ y_0, y_1 and y_2 are independent of each other.  exp(−θ/c) is positive defini
 does not know which direction is up.  `studies.measured.light_prior` fits the numbers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path

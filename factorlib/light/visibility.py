@@ -12,8 +12,6 @@ the d_k, so no factor may be narrower than their spacing: a lobe's sharpness λ 
 grows likewise.  The two sums over k for all points and lobes are two matrix products.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

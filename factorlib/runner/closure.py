@@ -11,8 +11,6 @@ A module declares what else its numbers depend on in constants, which are read f
                                           count, the folder does not
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """State of a dataset before a run: each step's record, from the sources, the dataset and the installed packages."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -85,7 +83,7 @@ class DatasetState:
         """Return the description of a stage with which a worker loads it."""
         stage = self.spec.pipeline.stages[name]
         cores = MOST_CORES if stage.cores == "all" else stage.cores
-        place = self.project.code_root, self.project.package, name
+        place = self.project.root, self.project.package, name
         return StageCode(*place, stage.values, self.project.pipeline_file, stage.threads, cores)
 
     def file_faults(self, steps: Iterable[Step]) -> list[str]:

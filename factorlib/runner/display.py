@@ -4,8 +4,6 @@ A terminal receives text alone.  Messages have names of files and texts of parse
 none of it may move the cursor, set a colour or a title, or ring the bell.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import sys

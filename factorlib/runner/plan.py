@@ -6,8 +6,6 @@ time and no path outside the dataset.  The hash of the record is the step's key,
 the reason for a rerun.  A step whose inputs are not made yet is a *maybe*: it reruns only if they come out different.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence

@@ -9,8 +9,6 @@
 A view, in store/views, has the files of all photos of a stage in one folder, as hard links.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shlex

@@ -1,7 +1,5 @@
 """Verbs of the command line.  Each shows or runs the same plan, and returns the exit code."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import inspect
@@ -158,16 +156,11 @@ def _result(state: DatasetState, planned: PlannedStep) -> Entry | None:
     return state.store.entry(planned.key) if planned.status == "current" else None
 
 
-def show_graph(project: Project, mermaid: bool = False) -> int:
-    """Print the stages in order, each with its inputs; or a Mermaid diagram, with double frames for many steps."""
+def show_graph(project: Project) -> int:
+    """Print the stages in order, each with its inputs."""
     pipeline = pipeline_of(project)
-    stages = {name: pipeline.stages[name] for name in pipeline.order()}
-    if mermaid:
-        nodes = [f"  {name}[[{name}]]" if stage.over else f"  {name}[{name}]" for name, stage in stages.items()]
-        arrows = [f"  {above} --> {name}" for name, stage in stages.items() for above in stage.upstream]
-        print("graph TD", *nodes, *arrows, sep="\n")
-        return 0
-    for name, stage in stages.items():
+    for name in pipeline.order():
+        stage = pipeline.stages[name]
         over = f"per {stage.over}" if stage.over else "whole set"
         remark = "   (only for sets that need it)" if stage.when else ""
         remark = "   (only on request)" if stage.optional else remark
@@ -175,17 +168,12 @@ def show_graph(project: Project, mermaid: bool = False) -> int:
     return 0
 
 
-def show_logs(project: Project, request: Request, item: str | None) -> int:
-    """Print time, memory, warnings and versions of current results; of one photo or recipe, or of all."""
+def show_logs(project: Project, request: Request) -> int:
+    """Print time, memory, warnings and versions of current results."""
     state = read_state(project, request, look=True)
     selected = [p for p in state.plan() if not request.targets or p.step.stage in request.targets]
-    if not (selected := [p for p in selected if item in (None, p.step.item)]):
-        if item is None:
-            raise InputError(
-                "the requested stages have no steps for this dataset", key="STAGE", cure="name other stages"
-            )
-        cure = did_you_mean(item, [*state.data.photos, *state.recipes])
-        raise InputError(f"no requested step belongs to a photo or recipe {item!r}", key="PHOTO", cure=cure)
+    if not selected:
+        raise InputError("the requested stages have no steps for this dataset", key="STAGE", cure="name other stages")
     versions: dict[str, dict[str, None]] = {}
     for p in selected:
         if (entry := _result(state, p)) is None:
@@ -218,7 +206,7 @@ def show_params(project: Project, stages: list[str] | None) -> int:
         if others := pipeline.stages[name].params_of:
             print(f"{name} takes the parameters of {', '.join(others)}")
             continue
-        params = load_stage(StageCode(project.code_root, project.package, name, {}, project.pipeline_file)).Params
+        params = load_stage(StageCode(project.root, project.package, name, {}, project.pipeline_file)).Params
         for param, values, default, text in parameters(params) or [("", "none", "", "It has no parameters.")]:
             print(f"{name}.{param} = {default}    ({values})" if param else name)
             print(textwrap.fill(text, 100, initial_indent="    ", subsequent_indent="    "))

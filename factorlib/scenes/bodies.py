@@ -10,17 +10,14 @@ None looks the same from two sides. But a smooth body of one material and its mi
 seen from opposite sides from far away, so a mirrored mask of the first three is hard to tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.generate.chair import dowel, legs, shell
-from factorlib.generate.solids import BUMPS, revolve
-from factorlib.geometry import open3d as o3d
+from factorlib.generate.chair import decimate, dowel, legs, shell
+from factorlib.generate.solids import blob, revolve
 from factorlib.meshes.mesh import Mesh, closed_grid
 from factorlib.meshes.read_mesh import CREASE_DEG, usable
 from factorlib.meshes.triangle_soup import TriangleSoup
@@ -38,21 +35,9 @@ BODY = ((0.0, 0.5), (0.20, 0.5), (0.22, 0.45), (0.17, 0.34), (0.26, 0.15), (0.34
 
 
 def bumpy_ball() -> list[Part]:
-    """Return a ball with the bumps of data/synthetic's blob."""
-    theta = np.arange(1, ROWS) / ROWS * np.pi
-    phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
-    sin = np.sin(theta)[:, None]
-    direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
-
-    def surface(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Return the points of the surface in these unit directions."""
-        size = np.full(direction.shape[:-1], 0.42)
-        for axis, height, sharpness in BUMPS:
-            size += 0.45 * height * np.exp(sharpness * (direction @ (np.array(axis) / np.linalg.norm(axis)) - 1))
-        return direction * size[..., None]
-
-    top, bottom = surface(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]))
-    return [_grid(surface(direction), top, bottom, 1)]
+    """Return the blob of data/synthetic, of more triangles."""
+    ball = blob(ROWS, COLUMNS)
+    return [(ball.vertices, ball.faces, 1)]
 
 
 def hook() -> list[Part]:
@@ -150,8 +135,8 @@ def photographed_mesh(shape: str) -> Mesh:
 def rough_mesh(shape: str, seed: int) -> Mesh:
     """Warp the shape of ROUGH_TRIANGLES: each vertex is moved by a smooth field, at most by WARP of the extent."""
     parts = SHAPES[shape]()
-    total = sum(len(faces) for _, faces, _ in parts)
-    coarse = [decimate(part, max(round(ROUGH_TRIANGLES * len(part[1]) / total), 8)) for part in parts]
+    share = ROUGH_TRIANGLES / sum(len(faces) for _, faces, _ in parts)
+    coarse = [(*decimate(v, f, max(round(share * len(f)), 8)), label) for v, f, label in parts]
     vertices = np.concatenate([part[0] for part in coarse])
     extent = float(np.ptp(vertices, axis=0).max())
     rng = np.random.default_rng(seed)
@@ -167,15 +152,7 @@ def rough_mesh(shape: str, seed: int) -> Mesh:
     return mesh_from_parts([(v + scale * field(v), f, label) for v, f, label in coarse], f"rough {shape}")
 
 
-def decimate(part: Part, triangles: int) -> Part:
-    """Decimate the part to about so many triangles, by Open3D's quadric error metrics (Garland and Heckbert 1997)."""
-    vertices, faces, label = part
-    whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
-    few = whole.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
-    return np.asarray(few.vertices), np.asarray(few.triangles), label
-
-
-def mesh_from_parts(parts: list[Part], name: str) -> Mesh:
+def mesh_from_parts(parts: list[Part], name: str, crease_deg: float = CREASE_DEG) -> Mesh:
     """Return the parts as one mesh; `name` is its name in errors."""
     first = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts])
     faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, first)]).astype(np.int64)
@@ -183,4 +160,4 @@ def mesh_from_parts(parts: list[Part], name: str) -> Mesh:
     soup = TriangleSoup(
         np.concatenate([v for v, _, _ in parts]), faces, label * 0, [("all",)], np.full((len(faces), 3, 3), np.nan)
     )
-    return usable(soup, label, CREASE_DEG, name)
+    return usable(soup, label, crease_deg, name)

@@ -1,7 +1,5 @@
 """Stages run on a data set without the runner, as tests and studies call them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType

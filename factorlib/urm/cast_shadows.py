@@ -16,8 +16,6 @@ of `WEIGHT` pixels, s the spread, and d the RMS difference between r and that of
 lie beside those of a mesh that is not exact.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ A pixel is observed where the mask and the mesh have the same material, the radi
 faces the camera. Elsewhere normal and radiance do not belong together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 

@@ -14,8 +14,6 @@ highlight are all kept. The selected pixels are spread evenly over their stratum
 are scaled so that the sum of weights of each stratum is preserved.
 """
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 from jaxtyping import Int

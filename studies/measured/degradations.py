@@ -6,6 +6,7 @@ set.
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import yaml
 from jaxtyping import Float
 from PIL import Image, ImageFilter
 
-from factorlib.generate.chair import bend_parts, bent_chair, chair
+from factorlib.generate.chair import bend_parts, chair
 from factorlib.generate.folder import write_labels, write_light, write_normals, write_obj, write_photo, write_yaml
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.tone import srgb_decode, srgb_encode
@@ -43,34 +44,15 @@ def exact(folder: Path, spec: Spec, rng: Rng) -> None:
             obj["pose"] = poses[photo["name"]][obj["name"]]
 
 
-def rough(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Give a mesh of 500 triangles a part, bent by 2 % of its extent."""
-    write_obj(folder / MESH, bent_chair(rng, 500, 0.02))
+def bend_chair(folder: Path, spec: Spec, rng: Rng, triangles: int, warp: float, stretched: bool = False) -> None:
+    """Give a mesh of so many triangles a part, bent by a share of its extent; stretched, it is another chair."""
+    axes = np.exp(rng.normal(0, 0.25, 3)) if stretched else 1.0
+    parts = bend_parts(chair(), rng, triangles, warp)
+    write_obj(folder / MESH, {name: (vertices * axes, faces) for name, (vertices, faces) in parts.items()})
 
 
-def rougher(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Give a mesh of 200 triangles a part, bent by 5 %."""
-    write_obj(folder / MESH, bent_chair(rng, 200, 0.05))
-
-
-def another_chair(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Give a mesh of 80 triangles a part, bent by 10 % and stretched: another chair."""
-    axes = np.exp(rng.normal(0, 0.25, 3))
-    write_obj(folder / MESH, {name: (v * axes, faces) for name, (v, faces) in bent_chair(rng, 80, 0.1).items()})
-
-
-def bent(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Give meshes of 500 triangles, each bent by 2 % of its extent."""
-    bend_meshes(folder, rng, 500, 0.02)
-
-
-def bent_further(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Give meshes of 200 triangles, each bent by 5 % of its extent."""
-    bend_meshes(folder, rng, 200, 0.05)
-
-
-def bend_meshes(folder: Path, rng: Rng, triangles: int, warp: float) -> None:
-    """Bend every mesh of a set of solids."""
+def bend_solids(folder: Path, spec: Spec, rng: Rng, triangles: int, warp: float) -> None:
+    """Give meshes of so many triangles, each bent by a share of its extent."""
     for file in sorted((folder / "meshes").glob("*.ply")):
         mesh = read_mesh(file, ["all"], "all")
         vertices, faces = bend_parts({"all": (mesh.vertices, mesh.faces)}, rng, triangles, warp)["all"]
@@ -159,24 +141,21 @@ def shrink(file: Path, resampling: Image.Resampling) -> tuple[np.ndarray, int | 
 
 
 KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
-    function.__name__: function
-    for function in (
-        bent,
-        bent_further,
-        exact,
-        rough,
-        rougher,
-        another_chair,
-        few,
-        one_photo,
-        unlinked,
-        miscalled,
-        clipped,
-        dark,
-        noisy,
-        developed,
-        tiny,
-    )
+    "exact": exact,
+    "bent": partial(bend_solids, triangles=500, warp=0.02),
+    "bent_further": partial(bend_solids, triangles=200, warp=0.05),
+    "rough": partial(bend_chair, triangles=500, warp=0.02),
+    "rougher": partial(bend_chair, triangles=200, warp=0.05),
+    "another_chair": partial(bend_chair, triangles=80, warp=0.1, stretched=True),
+    "few": few,
+    "one_photo": one_photo,
+    "unlinked": unlinked,
+    "miscalled": miscalled,
+    "clipped": clipped,
+    "dark": dark,
+    "noisy": noisy,
+    "developed": developed,
+    "tiny": tiny,
 }
 # Degradations of a set of chairs, one after the other, and of one of solids; each entry is used equally often.
 MIXED = (

@@ -2,21 +2,20 @@
 
 Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
 (`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
-build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  The conclusion from the cases is
-not a step: it takes a second and is written anew after each run (`studies.run.tables`).
+build/studies/quick, so that no reader takes one for the other.  To delete them all, delete that folder.  The conclusion
+from the cases is not a step: it takes a second and is written anew after each run (`studies.run.tables`).
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner import results_folder, verbs
+from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
 from studies.catalogue import STUDIES
-from studies.study import FULL, QUICK, Scale
+from studies.study import FULL, Scale
 
 SLICES = ("case", "worlds", "sets")
 
@@ -78,7 +77,7 @@ def make(
 ) -> int:
     """Run the steps of studies that are not current.
 
-    Their results and the page of all that are done lie in build/studies afterwards.
+    Their results lie in build/studies afterwards.
 
     settings: where their steps run, as `executor=tcp://…`
 
@@ -93,33 +92,9 @@ def make(
         request = verbs.Request(name, targets=list(study.steps), settings=settings or [], force=force)
         codes.append(verbs.make(project, request))
         if codes[-1] == 0:
-            from studies.run.tables import write_index, write_study  # here: a plan must not pay for science
+            from studies.run.tables import write_study  # here: a plan must not pay for science
 
             folder = project.build / name
             write_study(study, scale, folder / study.steps[-1] / "scores.json", folder)
             print(f"  study: {project.short_path(folder / 'paragraph.md')}")
-            print(f"  page: {project.short_path(write_index(project))}")
     return next((code for code in codes if code), 0)
-
-
-def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
-    """Forget the results of studies; `collect` then frees their disk space.  Return 0."""
-    from studies.run.tables import FILES, write_index
-
-    project = studies(scale, root)
-    for name in names:
-        for file in FILES:
-            (project.build / name / file).unlink(missing_ok=True)
-        results_folder.clean(project, name)
-    if project.build.is_dir():
-        write_index(project)
-    return 0
-
-
-def collect(agreed: Callable[[], bool]) -> int:
-    """List the results that no study names any more, and delete them if `agreed` returns True.  Return 0."""
-    for project in (studies(FULL), studies(QUICK)):
-        if (project.build / "store").is_dir():
-            print(f"{project.short_path(project.build)}:")
-            results_folder.collect(project, agreed)
-    return 0

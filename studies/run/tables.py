@@ -1,4 +1,4 @@
-"""Pages of studies: paragraph.md and tables of each, index.md of all, and the tables of docs/studies.md."""
+"""Pages of studies: paragraph.md and table.json of each, and the tables of docs/studies.md."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -10,29 +10,20 @@ from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.project import LIBRARY, Project
 from factorlib.wholefile import replace_file
 from studies.catalogue import STUDIES
-from studies.conclusion import Conclusion, claims, conclude, csv_text, numbers, paragraph
+from studies.conclusion import Conclusion, claims, conclude, numbers, paragraph
 from studies.measured.tools import machine, markdown_table, replace_sections
 from studies.run import studies
 from studies.study import FULL, Scale, Score, Study
 
 DOCS = LIBRARY / "docs" / "studies.md"
 MOST_MEASURES = 4  # measures of a study in the documentation
-FILES = ("table.csv", "table.json", "paragraph.md")
 
 
 def write_study(study: Study, scale: Scale, scores: Path, folder: Path) -> None:
-    """Write the conclusion of a study into a folder: table.csv, table.json, paragraph.md; scores: scores.json."""
+    """Write the conclusion of a study into a folder, as table.json and paragraph.md; scores: scores.json."""
     table = conclude(study, scale, msgspec.convert(read_json(scores), dict[str, Score]))
-    for file, text in zip(FILES, (csv_text(table), json_text(table), paragraph(table)), strict=True):
+    for file, text in {"table.json": json_text(table), "paragraph.md": paragraph(table)}.items():
         replace_file(folder / file, text.encode())
-
-
-def write_index(project: Project) -> Path:
-    """Write index.md, a table of all studies of this scale that are finished; return its path."""
-    rows = [[f"[{c.title}]({name}/paragraph.md)", c.paper, c.answer] for name, c in conclusions(project).items()]
-    text = "# Studies\n\n" + markdown_table(["study", "the paper", "here"], rows) + "\n"
-    replace_file(project.build / "index.md", text.encode())
-    return project.build / "index.md"
 
 
 def conclusions(project: Project) -> dict[str, Conclusion]:

@@ -1,7 +1,5 @@
 """Meshes and photos of known pose for the tests of alignment."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
@@ -10,23 +8,14 @@ from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.read_mesh import usable
-from factorlib.meshes.triangle_soup import TriangleSoup
+from factorlib.scenes.bodies import mesh_from_parts
 
 
 def mesh_of(parts: list, labels: list[int] | None = None, crease_deg: float = 40.0) -> Mesh:
     """A mesh of trimesh parts, each with its label."""
     labels = labels or [1] * len(parts)
-    whole = trimesh.util.concatenate(parts)
-    label = np.repeat(labels, [len(p.faces) for p in parts])
-    soup = TriangleSoup(
-        np.array(whole.vertices),
-        np.array(whole.faces),
-        label * 0,
-        [("all",)],
-        np.full((len(whole.faces), 3, 3), np.nan),
-    )
-    return usable(soup, label, crease_deg, "test")
+    shapes = [(part.vertices, part.faces, label) for part, label in zip(parts, labels, strict=True)]
+    return mesh_from_parts(shapes, "test", crease_deg)
 
 
 def at(part, *place):

@@ -128,7 +128,7 @@ def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing_but_pic
 @pytest.mark.parametrize("photos, files, expected", [
     ("front/7 back/7", "front/7.png back/7.jpg.png", {"front_7": "front/7.png", "back_7": "back/7.jpg.png"}),
     ("rig/front/7 rig/back/7", "front/7.bmp back/7_mask.png", {"rig_front_7": "front/7.bmp", "rig_back_7": "back/7_mask.png"}),
-    ("front/7 back/7", "rig/front/7.png 7.png", {"front_7": "rig/front/7.png", "back_7": "?"}),
+    ("front/7 back/7", "rig/front/7.png 7.png", {"front_7": "rig/front/7.png", "back_7": "back_7.png"}),
     ("front/7 back/7", "front/7_oak.png back/7/oak.png", {"front_7": {"oak": "front/7_oak.png"}, "back_7": {"oak": "back/7/oak.png"}}),
     ("front/7 8", "7.tif 8.gif", {"8": "8.gif"}),
     ("ku\u0308che", "k\u00fcche.png", {"k_che": "k\u00fcche.png"}),

@@ -3,8 +3,6 @@
 Tests spoil one file at a time; `changed` puts it back.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """A small DNG: a preview first, as cameras write it, and the sensor's pixels in a sub-picture."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

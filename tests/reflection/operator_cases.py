@@ -5,8 +5,6 @@ break at grazing views, mirrors, lobes of no width or of all, and lobes along ev
 from the ordinary in one respect, the last one in all of them.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from types import SimpleNamespace

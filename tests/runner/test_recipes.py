@@ -1,6 +1,7 @@
 """A stage over recipes: a step for each that is asked for, its pictures under the recipe's name, and nothing else rerun for it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from factorlib.runner import verbs
 from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import Project, Provider, Recipe
 from factorlib.runner.results_folder import all_results, clean, collect
+from tests.refusal import refusal
 from tests.runner import toy
 from tests.runner.toy import write
 
@@ -149,3 +151,8 @@ def test_a_recipe_that_is_not_there_or_can_have_no_folder_is_refused(project, tm
     with pytest.raises(InputError) as error:
         project.recipes(project.provider.read(project.root / "data" / "set"), [w.format(tmp_path) for w in words])
     assert wrong in str(error.value)
+
+
+def test_logs_of_a_stage_over_recipes_where_there_are_none_say_so(project):
+    shutil.rmtree(project.root / "recipes")
+    refusal("no steps for this dataset", verbs.show_logs, project, Request("set", ["shout"]))

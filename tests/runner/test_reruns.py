@@ -1,13 +1,11 @@
 """Which steps get new keys by a single change: exactly those that the change can reach, and those below them; `why` names it.
 
-Of a copy of this project, at the level of plans: files are edited, nothing is run.  Who can be reached by a change of
-code another library says (grimp, of import-linter).  `make test` takes a sample that is the same each time,
-`make test-long` every module, file and package.
+Of a copy of this project, at the level of plans: files are edited, nothing is run.  What a stage imports another library
+says, too (grimp, of import-linter).
 """
 
 import contextlib
 import os
-import random
 from functools import cache
 
 import grimp
@@ -16,16 +14,17 @@ import yaml
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
+from factorlib.runner.closure import Sources
 from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.plan import Listing, plan
 from factorlib.runner.project import LIBRARY, photo_sets, read_pipeline
+from factorlib.runner.store import FileHashes
 from tests.faults.sample import edited as edited_data
 from tests.runner import toy
 from tests.runner.toy import make, real_project, reasons, state, write
 
 PIPELINE = read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices).for_data(lambda _: True)
 STAGES = list(PIPELINE.stages)
-LONG = pytest.mark.long
 
 
 class Everything(dict):
@@ -56,13 +55,6 @@ def usual(project):
     return keys(project)
 
 
-def other_keys(project, settings=()):
-    """The steps whose keys are not the usual ones."""
-    before, now = usual(project), keys(project, settings)
-    assert now.keys() == before.keys()
-    return {step for step in now if now[step] != before[step]}
-
-
 @contextlib.contextmanager
 def edited(project, name: str, content: bytes):
     """Within, a file of the project holds something else."""
@@ -75,24 +67,6 @@ def edited(project, name: str, content: bytes):
         (project.root / name).write_bytes(before)
 
 
-def below(project, stages):
-    """The steps of those stages, and all that take their results, however far: read from pipeline.yaml, step by step."""
-    result = {step for step in usual(project) if step.partition("/")[0] in stages}
-    for name in PIPELINE.order():
-        of = (step for step in usual(project) if step.partition("/")[0] == name)
-        result |= {step for step in of if any(_takes(step, above) for above in result)}
-    return result
-
-
-def _takes(step, above):
-    (stage, _, photo), (above_stage, _, above_photo) = step.partition("/"), above.partition("/")
-    alone = PIPELINE.stages[stage].over == "photo" and PIPELINE.stages[above_stage].over == "photo"
-    return above_stage in PIPELINE.stages[stage].inputs and (photo == above_photo or not alone)
-
-
-# ── code and files of packages ───────────────────────────────────────────────────────────────────────────────────────
-
-
 @cache
 def imports():
     """What imports what; a module also imports the packages above it, which Python runs first."""
@@ -102,39 +76,12 @@ def imports():
     return graph
 
 
-@cache
-def reached_by(stage):
-    """The modules that a stage imports, however far."""
-    return {f"stages.{stage}", *imports().find_upstream_modules(f"stages.{stage}")}
-
-
-def whole_modules():
-    """The file of each module that any stage runs, an addition to it, and the stages that run it."""
-    for path in sorted(
-        path.relative_to(LIBRARY) for top in ("factorlib", "stages") for path in (LIBRARY / top).rglob("*.py")
-    ):
-        name = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
-        if stages := {stage for stage in STAGES if name in reached_by(stage)}:
-            yield str(path), b"\nNEW = 1\n", stages
-
-
-def files_of_packages():
-    """Weights, templates, kernels: whatever lies in the folder of a module that is run."""
-    for path in sorted((LIBRARY / "factorlib").rglob("*")):
-        if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts:
-            folder = next(f for f in path.parents if (f / "__init__.py").exists()).relative_to(LIBRARY)
-            package = ".".join(folder.parts)
-            stages = {s for s in STAGES if any(m == package or m.rpartition(".")[0] == package for m in reached_by(s))}
-            yield str(path.relative_to(LIBRARY)), b"\n", stages
-
-
-@pytest.mark.parametrize("few", [True, pytest.param(False, marks=LONG)])
-@pytest.mark.parametrize("files, count", [(whole_modules, 4), (files_of_packages, 3)])
-def test_a_change_reruns_who_is_reached_by_it_and_what_is_below_and_nothing_else(real, files, count, few):
-    cases = list(files())
-    for name, more, stages in random.Random(17).sample(cases, count if few else len(cases)):
-        with edited(real, name, (LIBRARY / name).read_bytes() + more):
-            assert other_keys(real) == below(real, stages), name
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_sources_in_a_key_are_all_that_another_library_finds_imported_and_no_others(stage):
+    record = Sources([LIBRARY], FileHashes(None)).closure("stages", stage, LIBRARY / "pipeline.yaml").record
+    modules = {name.removeprefix("source:") for name in record if name.startswith("source:")}
+    assert modules == {f"stages.{stage}", *imports().find_upstream_modules(f"stages.{stage}")}
+    assert "factorlib.stage" in modules and not any(name.startswith("factorlib.runner") for name in modules)
 
 
 def test_a_photo_held_out_for_one_run_has_the_keys_of_one_that_the_dataset_holds_out_and_spares_what_it_cannot_reach(
@@ -165,7 +112,7 @@ def test_an_edit_that_keeps_size_and_time_is_noticed(real):
             os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
             assert (path.stat().st_size, path.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns)
             assert keys(real) != known, name
-    assert other_keys(real) == set()
+    assert keys(real) == usual(real)
 
 
 # ── what else counts ─────────────────────────────────────────────────────────────────────────────────────────────────

@@ -103,8 +103,7 @@ def test_plan_why_and_graph_show_the_same_plan(project, capsys):
         (partial(verbs.show_plan, every_reason=True), "upper      to run  a\n    file a.txt: changed"),
     ):
         assert show(project, verbs.Request("set")) == 0 and output in capsys.readouterr().out
-    for mermaid, output in ((False, "total      whole set  <- count, table"), (True, "upper --> count")):
-        assert verbs.show_graph(project, mermaid) == 0 and output in capsys.readouterr().out
+    assert verbs.show_graph(project) == 0 and "total      whole set  <- count, table" in capsys.readouterr().out
 
 
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -210,8 +209,8 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     write(project.root / "data" / "set" / "a.txt", "odd")
     edit(project, "stages/table.py", "import json", "import json, filelock")
 
-    def logs(*stages, photo=None, settings=()):
-        assert verbs.show_logs(project, verbs.Request("set", list(stages) or None, list(settings)), photo) == 0
+    def logs(*stages, settings=()):
+        assert verbs.show_logs(project, verbs.Request("set", list(stages) or None, list(settings))) == 0
         return capsys.readouterr().out
 
     assert make(project) == 0 and capsys.readouterr().err.count("a is odd") == 1
@@ -226,10 +225,6 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     assert not any(word in text for text in texts for word in (f'"{os.uname().nodename}"', str(project.root)))
     steps = [line.split()[0] for line in logs("upper").splitlines() if not line.startswith(" ")]
     assert steps == ["upper/a", "upper/b"]
-    assert "count/b" in logs(photo="b") and "upper/a" not in logs(photo="b")
-    with pytest.raises(InputError, match=r"no requested step belongs to a photo or recipe 'aa'") as caught:
-        logs(photo="aa")
-    assert caught.value.key == "PHOTO"
     output = logs("table", settings=["table.scale=3"])
     assert re.search(r"^table +to run: parameter scale: default -> 3$", output, re.M)
 

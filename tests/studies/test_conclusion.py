@@ -6,18 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from studies.conclusion import (
-    Cell,
-    Conclusion,
-    Row,
-    conclude,
-    csv_text,
-    difference,
-    paragraph,
-    spread,
-)
+from studies.conclusion import Conclusion, conclude, difference, paragraph
 from studies.run import studies
-from studies.run.tables import write_index
+from studies.run.tables import conclusions
 from studies.study import FULL, QUICK, Claim, Score, Setting, Study, case_name
 
 
@@ -83,8 +74,6 @@ CLAIM, OTHER = Claim("entries", "a", "b", "a is better than b"), Claim("roughnes
 def test_the_sentence_says_what_was_found(a, b, answer, words):
     table = conclude(study(CLAIM), FULL, scores(FULL, a=a, b=b))
     assert words in paragraph(table) and table.answer == answer
-    lines = csv_text(table).splitlines()
-    assert len(lines) == 5 and lines[1].startswith("toy,a,a,entries,,5,")
     assert msgspec.convert(json.loads(msgspec.json.encode(table)), Conclusion, str_keys=True) == table
 
 
@@ -97,25 +86,8 @@ def test_an_answer_in_part_says_of_how_many_and_a_quick_study_concludes_nothing(
     assert "no conclusion" in paragraph(table) and table.answer.startswith("not tested") and not table.claims
 
 
-# ── pages ────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def made(rows, measures=("entries", "seconds"), quick=""):
-    """A table of values by seed; rows: by label, the values of each measure."""
-    table = {n: {m: Cell(spread(v), by_seed(*v)) for m, v in zip(measures, of, strict=False)} for n, of in rows.items()}
-    seeds = tuple(range(len(next(iter(rows.values()))[0])))
-    rows = [Row(n, n, c) for n, c in table.items()]
-    return Conclusion("prior", "Title <&>", "?", "p", "v", quick, seeds, measures, rows)
-
-
-def steps(*starts):
-    values = {f"s{k}": (k + v, 2 * k + 1.0) for k, v in enumerate(starts)}
-    return {name: ([a + 0.01 * s for s in range(5)], [b + s for s in range(5)]) for name, (a, b) in values.items()}
-
-
-def test_the_page_leaves_tables_of_another_version_out(tmp_path, capsys):
-    project, table = studies(QUICK, tmp_path), json.loads(msgspec.json.encode(made(steps(0, 1))))
-    for name, of in {"prior": table, "parts": table | {"rows": 1}}.items():
-        (project.build / name).mkdir(parents=True)
-        (project.build / name / "table.json").write_text(json.dumps(of))
-    assert write_index(project).read_text().count(".md)") == 1 and "STUDY=parts" in capsys.readouterr().out
+def test_a_table_of_another_version_is_left_out_and_named(tmp_path, capsys):
+    project = studies(QUICK, tmp_path)
+    (project.build / "parts").mkdir(parents=True)
+    (project.build / "parts" / "table.json").write_text('{"study": "parts", "rows": 1}')
+    assert conclusions(project) == {} and "make study STUDY=parts" in capsys.readouterr().out

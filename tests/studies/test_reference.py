@@ -6,8 +6,6 @@ a small run, stage by stage, in `make test`; of the data set as it is in `make t
 current there is not made again: keys are by content.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

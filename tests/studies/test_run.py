@@ -13,7 +13,7 @@ from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
 from studies.catalogue import STUDIES
 from studies.run import data_of, studies
-from studies.run.tables import write_index, write_study
+from studies.run.tables import write_study
 from studies.steps import score, solve, worlds
 from studies.study import QUICK
 
@@ -83,4 +83,3 @@ def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     assert all(0 < row["cells"]["entries"]["spread"]["mean"] < 0.5 for row in table["rows"])
     text = (home / "paragraph.md").read_text()
     assert "no conclusion" in text and "| 1 × 1 |" in text
-    assert f"({NAME}/paragraph.md)" in write_index(studies(scale, tmp_path)).read_text()
