@@ -25,14 +25,23 @@ from factorlib.runner.display import printable, printable_streams
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.wholefile import disk_error
 
+SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
+
 
 def project() -> Project:
-    """Return the project: the checkout of FACTORLIB_ROOT, or that of this package; InputError if there is none."""
-    root = Path(os.environ.get("FACTORLIB_ROOT") or LIBRARY).resolve()
-    if not (root / PIPELINE).is_file():
+    """Return the project: the checkout of FACTORLIB_ROOT, of this package, or of the current folder.
+
+    Without a checkout, it is the current folder with the pipeline that pip installed with the package.
+    """
+    cwd = Path.cwd()
+    checkout = next((folder for folder in (LIBRARY, cwd, *cwd.parents) if (folder / PIPELINE).is_file()), None)
+    if not (root := os.environ.get("FACTORLIB_ROOT") or checkout):
+        for shipped in (folder / SHIPPED for folder in (LIBRARY, *LIBRARY.parents)):
+            if (shipped / PIPELINE).is_file():
+                return Project(cwd, photo_sets(), shipped=shipped)
         cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<folder with {PIPELINE}, stages and data>"
-        raise InputError(f"this folder has no {PIPELINE}", file=root, cure=cure)
-    return Project(root, photo_sets())
+        raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=cwd, cure=cure)
+    return Project(Path(root).resolve(), photo_sets())
 
 
 def dataset_of(arguments: Namespace) -> str:
@@ -171,7 +180,7 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
 }  # fmt: skip
 
 
-def dispatch(words: list[str]) -> int:
+def dispatch(words: list[str], program: str) -> int:
     """Run the verb of the command line and return its exit code.
 
     A first word that is neither an option nor a verb is a stage.
@@ -179,7 +188,7 @@ def dispatch(words: list[str]) -> int:
     if words and not words[0].startswith("-") and words[0] not in VERBS:
         words = ["stage", *words]
     epilog = "Any other word is the name of a stage: it is run with the stages that it needs."
-    parser = argparse.ArgumentParser("python -m factorlib", description=epilog)
+    parser = argparse.ArgumentParser(program, description=epilog)
     parsers = parser.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
     for name, (options, _, text) in VERBS.items():
         verb = parsers.add_parser(name, help=text, description=text, allow_abbrev=False)
@@ -215,7 +224,9 @@ def main() -> NoReturn:
     try:
         with printable_streams(), raise_on_signals():
             logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
-            sys.exit(dispatch(sys.argv[1:]))
+            sys.exit(
+                dispatch(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib")
+            )
     except InputError as error:
         sys.exit(printable(f"error: {error}"))
     except BrokenPipeError:  # The reader, such as `head`, has closed the pipe.

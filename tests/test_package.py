@@ -2,6 +2,7 @@
 
 import ast
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -17,7 +18,7 @@ from factorlib.setup import lock_text
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OURS = {"factorlib", "stages", "tests", "studies"}
-PACKED = ["factorlib", "pyproject.toml", "README.md", "LICENSE"]
+PACKED = ["factorlib", "stages", "recipes", "pipeline.yaml", "pyproject.toml", "README.md", "LICENSE"]
 
 
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
@@ -67,10 +68,39 @@ def installed(tmp_path_factory):
     return folder / "site"
 
 
+RECORDS = """
+import json
+from factorlib.__main__ import project
+from factorlib.runner.dataset_state import Request, read_state
+records = read_state(project(), Request("data/moved")).records
+print(*(f"{step} {json.dumps(record, sort_keys=True, default=str)}" for step, record in records.items()), sep="\\n")
+"""
+
+
+def run(site, *words, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(site), "FACTORLIB_ROOT": ""}
+    return subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
+
+
 def test_an_installed_wheel_has_its_operator(installed, tmp_path):
     code = "import factorlib; from factorlib.reflection import reflection_operator; print(factorlib.__file__, reflection_operator('network'))"
-    environment = {**os.environ, "PYTHONPATH": str(installed)}
-    process = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
+    process = run(installed, "-c", code, cwd=tmp_path)
     assert process.returncode == 0 and process.stdout.startswith(str(installed)), process.stderr
+
+
+def test_an_installed_command_away_from_a_checkout_has_the_same_pipeline_and_the_same_keys(installed, tmp_path):
+    """What a result is known by does not depend on where the stages lie: the records of a plan are those of the checkout."""
+    shutil.copytree(ROOT / "data" / "synthetic", tmp_path / "data" / "moved")
+    command = str(installed / "bin" / "factorlib")
+    process = run(installed, command, "validate", "-d", "moved", cwd=tmp_path)
+    assert process.returncode == 0 and "are good" in process.stdout, process.stderr
+    process = run(installed, command, "plan", "-d", "moved", "--recipe", "insert", cwd=tmp_path)
+    assert process.returncode == 0 and "recipes" in process.stdout, process.stderr
+    assert (tmp_path / "build").is_dir() and not (installed / "build").exists()
+    here, there = (run(site, "-c", RECORDS, cwd=tmp_path) for site in (installed, ROOT))
+    assert here.stdout == there.stdout != "", here.stderr + there.stderr
+
+
+def test_an_installed_command_in_a_checkout_takes_its_pipeline(installed):
+    process = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=ROOT / "data")
+    assert process.returncode == 0 and "solve" in process.stdout

@@ -206,7 +206,7 @@ def show_params(project: Project, stages: list[str] | None) -> int:
         if others := pipeline.stages[name].params_of:
             print(f"{name} takes the parameters of {', '.join(others)}")
             continue
-        params = load_stage(StageCode(project.root, project.package, name, {}, project.pipeline_file)).Params
+        params = load_stage(StageCode(project.code_root, project.package, name, {}, project.pipeline_file)).Params
         for param, values, default, text in parameters(params) or [("", "none", "", "It has no parameters.")]:
             print(f"{name}.{param} = {default}    ({values})" if param else name)
             print(textwrap.fill(text, 100, initial_indent="    ", subsequent_indent="    "))
