@@ -22,7 +22,7 @@ from factorlib.dataset.paths import Refusal
 from factorlib.dataset.sources.external_cameras import READERS, match_images
 from factorlib.dataset.sources.source_image import GRID, SourceImage
 from factorlib.dataset_draft import check_target, new_dataset, photos_in
-from factorlib.errors import InputError
+from factorlib.errors import InputError, raise_all
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.images.photo import box_majority, decode_photo, least_factor, open_photo
 from factorlib.images.picture import picture, write_png
@@ -152,25 +152,33 @@ def read_views(
         folder: a temporary folder
         report: called with the completed share and the current activity
 
-    Raises InputError if a photo needs a network that is not installed, or if no photo has a foreground.
+    Raises InputError if masks cannot be read, of all of them together, if a photo needs a network that is not
+    installed, or if no photo has a foreground.
     """
     views: dict[str, View] = {}
+    faults: list[InputError] = []
     network = None
     (folder / "masks").mkdir()
     for name, path in images.items():
         report(len(views) / len(images), f"{name}: mask")
         opened = open_photo(path, "PHOTOS")
         check_pixels(opened.size, MOST_MEGAPIXELS, path, "PHOTOS")
+        mask = None
+        if file := masks.get(name):
+            try:
+                labels = list(read_labels_in(file, "PHOTOS", opened.size))
+                mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
+            except InputError as fault:
+                faults.append(fault)
+        if faults:
+            continue
         photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), path)
         pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
         uncertain = 0.0
         matted = None
-        if file := masks.get(name):
-            labels = list(read_labels_in(file, "PHOTOS", opened.size))
-            mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
-        elif (opaque := opaque_pixels(path)) is not None:
-            mask = opaque
-        else:
+        if mask is None:
+            mask = opaque_pixels(path)
+        if mask is None:
             network = network or MatteModel(model)
             matted = pixels
             matte, uncertain = network(pixels, opened.size)
@@ -181,6 +189,7 @@ def read_views(
         prior = with_prior_focal(camera, photo.focal_px, "exif")
         small = PhotoForMotion(pixels.mean(axis=2).astype(np.uint8), objects, np.zeros_like(objects), *prior)
         views[name] = View(small, opened.size, uncertain, matted, describe_specks(mask))
+    raise_all(faults)
     if not any(view.small.objects.any() for view in views.values()):
         cure = "draw masks: `make new`, then `make label`"
         raise InputError("no photo has a foreground", file=path.parent, key="PHOTOS", cure=cure)

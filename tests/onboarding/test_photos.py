@@ -186,6 +186,17 @@ def test_a_mask_beside_a_photo_is_its_labels_or_a_matte_cut_at_half(tmp_path, to
         assert np.asarray(Image.open(tmp_path / "masks" / "a.png")).tolist() == [inside] * 2
 
 
+def test_masks_that_cannot_be_read_are_named_in_one_error(tmp_path):
+    names = [f"p{number}" for number in range(6)]
+    for name in names:
+        Image.fromarray(np.zeros((40, 60, 3), np.uint8)).save(tmp_path / f"{name}.jpg")
+        values = np.repeat([0, 130, 255], 20).astype(np.uint8)
+        Image.fromarray(np.tile(values, (40, 1))).save(tmp_path / f"{name}_mask.jpg")
+    images, masks = ({name: tmp_path / f"{name}{end}.jpg" for name in names} for end in ("", "_mask"))
+    error = refusal("is of a lossy format", read_views, images, masks, None, tmp_path, lambda share, text: None)
+    assert str(error).count("save labels as PNG") == 1 and "(and 5 more: p1_mask.jpg, p2_mask.jpg" in str(error)
+
+
 def test_a_photo_without_alpha_prints_nothing_and_one_that_hides_nothing_has_none(tmp_path, capfd):
     save(tmp_path / "a.tif", np.ones((2, 4, 3), np.float32))
     save(tmp_path / "b.tif", np.full((2, 4, 4), 65000, np.uint16), ["R", "G", "B", "A"])
