@@ -55,6 +55,10 @@ REVOLVED = (
     "every mask looks like a body of revolution, so `lathe: true` is written: if it is none, write "
     "`primitive: ball | box | cylinder` or `file: <mesh>` instead"
 )
+UNPLACED = (
+    "left out, for structure from motion does not place them: {}; they are blurred, turned, or of another thing, or no "
+    "photo overlaps with them: add photos between them and the others, each 10 to 20° from the next"
+)
 NAMES = "rename materials and meshes in dataset.yaml now, if at all: another name later makes all steps run again"
 
 
@@ -120,6 +124,9 @@ def dataset_from_photos(
             cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
         elif not meshes:
             cameras, outlines = cameras_of_motion(visible, report)
+            for name in cameras.left_out:
+                del views[name], visible[name]
+                (folder / "masks" / f"{name}.png").unlink()
         views, outlines = refine_masks(
             views, outlines, model, folder, lambda share, text: report(0.9 + share / 20, text)
         )
@@ -130,7 +137,8 @@ def dataset_from_photos(
                 lambda share: report(0.95 + share / 20, "parts by colour"),
             )  # fmt: skip
         if unknown := not cameras.source and not meshes:
-            cameras = outlined_shape(visible, report)
+            shape = outlined_shape(visible, report)
+            cameras = shape if shape.revolved else cameras
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
     return missing + [SHAPE] * (unknown and not cameras.revolved), [
         NAMES,
@@ -287,7 +295,9 @@ def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
 
 
 def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Cameras, list[Outline]]:
-    """Return the source `sfm`, and outlines by its cameras; no source where photos do not overlap.
+    """Return the source `sfm`, and outlines by its cameras; no source where photos do not overlap, but what would help.
+
+    Photos that are not placed are left out, if they are fewer than the others.
 
     Args:
         views: the photos with a foreground
@@ -296,14 +306,16 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
     photos = {name: view.small for name, view in views.items()}
     try:
         registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.4 * share, text))
-    except InputError:
-        return Cameras(), []
+    except InputError as error:
+        return Cameras(notes=[f"{error.fault}: {error.cure}"]), []
+    missing = [name for name in photos if name not in registered] if 2 * len(registered) > len(photos) else []
+    notes = [UNPLACED.format(", ".join(missing))] if missing else []
     cameras = {name: msgspec.structs.replace(photos[name].camera, focal=registered[name].focal) for name in registered}
     outlines = [
         Outline(name, photos[name].objects.astype(int), cameras[name], pose=each.pose)
         for name, each in registered.items()
     ]
-    return Cameras({"sfm": True}), outlines
+    return Cameras({"sfm": True}, notes=notes, left_out=missing), outlines
 
 
 def outlined_shape(views: Mapping[str, View], report: Report) -> Cameras:

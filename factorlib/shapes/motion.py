@@ -39,6 +39,7 @@ MOST_SIDE = 1600
 MOST_FEATURES = 4000
 LEAST_DISTORTION = 2.0  # least distortion that counts, pixels
 EXHAUSTIVE = 30  # greatest number of photos that are all matched with each other
+FEW = 10  # least number of photos of each hull, of larger sets
 ENOUGH = 0.9  # share of a larger set's photos that one region's model must register for the other not to be mapped
 POLL = 0.2  # time between reports, s
 SEED = 0
@@ -177,7 +178,11 @@ def _map_photos(
         part = np.where(photo.left_out, UNKNOWN, photo.objects.astype(int))
         camera = msgspec.structs.replace(photo.camera, focal=registered.focal)
         outlines.append(Outline(name, part, camera, pose=registered.pose))
-    if (overlap := hull_overlap([outline for outline in outlines if outline.is_visible])) < LEAST_AGREEMENT:
+    outlines = [outline for outline in outlines if outline.is_visible]
+    # a hull is what all its masks contain: that of many is cut by a few that are wrong
+    groups = max(len(outlines) // FEW, 1) if len(photos) > EXHAUSTIVE else 1
+    overlap = float(np.median([hull_overlap(outlines[k::groups]) for k in range(groups)]))
+    if overlap < LEAST_AGREEMENT:
         words = "cameras by %d points do not move with the objects (hull against masks: %.2f)"
         log.info(words, model.num_points3D(), overlap)
         return {}, 0
