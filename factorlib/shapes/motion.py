@@ -1,10 +1,11 @@
 """Cameras by structure from motion (COLMAP, Schönberger and Frahm 2016), on the CPU.
 
-The steps are SIFT, exhaustive matching, and incremental mapping. Either the camera moves about a scene at rest, or an
-object turns before a camera at rest. So features are matched twice: those on the objects, and all others. A model is
-accepted if a hull of the objects' masks fits into all of them; beside an object that turns, the background gives
-cameras at rest. Of accepted models, the one that registers more photos is kept. Seeds are fixed and one thread is used,
-so the same photos give the same cameras.
+The steps are SIFT, matching, and incremental mapping. Up to EXHAUSTIVE photos are all matched with each other, of more
+those pairs that probably overlap. Either the camera moves about a scene at rest, or an object turns before a camera at
+rest. So features on the objects, and all others, are matched among themselves. A model is accepted if a hull of the
+objects' masks fits into all of them; beside an object that turns, the background gives cameras at rest. Of accepted
+models, the one that registers more photos is kept. Features and matches use all cores, which changes neither; mapping
+uses one thread. Seeds are fixed, so the same photos give the same cameras.
 """
 
 import logging
@@ -44,6 +45,11 @@ ENOUGH = 0.9  # share of a larger set's photos that one region's model must regi
 POLL = 0.2  # time between reports, s
 SEED = 0
 DATABASE = "features.db"
+CURE = (
+    "structure from motion needs photos of one scene, each 10 to 20° from the next, with texture on the object or "
+    "around it; where the object turns before a camera at rest, photos each 5 to 10° from the next, with masks of the "
+    "object alone, and texture on it; without, give `file`, `lathe` or `primitive` meshes"
+)
 log = logging.getLogger("factorlib.shapes")
 
 
@@ -92,27 +98,22 @@ def cameras_by_motion(
     Raises:
         InputError: If fewer than three photos are registered.
     """
-    models = {}
+    models: dict[str, tuple[dict[str, RegisteredCamera], int]] = {}
     with TemporaryDirectory() as folder:
         root = Path(folder)
-        files, known_focals = _extract_features(root, photos, threads, report)
-        for begin, (region, on_objects) in zip((0.2, 0.6), (("on the objects", True), ("beside them", False))):
+        known_focals = _extract_features(root, photos, threads, report)
+        for begin, region in ((0.2, "on the objects"), (0.6, "beside them")):
             masks = {}
             for name, photo in photos.items():
-                masks[name] = (photo.objects if on_objects else ~photo.objects) & ~photo.left_out
+                masks[name] = (photo.objects if not models else ~photo.objects) & ~photo.left_out
             share = partial(_report_region, report, begin, region)
-            models[region] = _map_photos(root / region, photos, masks, files, known_focals, threads, share)
+            models[region] = _map_photos(root / region, photos, masks, known_focals, threads, share)
             if len(photos) > EXHAUSTIVE and len(models[region][0]) >= ENOUGH * len(photos):
                 break
     region, (cameras, points) = max(models.items(), key=lambda item: (len(item[1][0]), item[1][1]))
     if len(cameras) < LEAST_PHOTOS:
         fault = f"only {len(cameras)} of {len(photos)} photos can be registered: too few of their features match"
-        cure = (
-            "structure from motion needs photos of one scene, each 10 to 20° from the next, with texture on the object "
-            "or around it; where the object turns before a camera at rest, photos each 5 to 10° from the next, masks "
-            "of the object alone, and texture on it; without, give `file`, `lathe` or `primitive` meshes"
-        )
-        raise InputError(fault, file="dataset.yaml", key="cameras.sfm", cure=cure)
+        raise InputError(fault, file="dataset.yaml", key="cameras.sfm", cure=CURE)
     log.info("cameras of %d of %d photos by %d points %s", len(cameras), len(photos), points, region)
     if missing := [name for name in photos if name not in cameras]:
         log.warning(
@@ -137,7 +138,6 @@ def _map_photos(
     root: Path,
     photos: Mapping[str, PhotoForMotion],
     masks: Mapping[str, Bool[np.ndarray, "h w"]],
-    files: Sequence[str],
     known_focals: set[int],
     threads: int,
     report: Callable[[float, str], None],
@@ -148,7 +148,6 @@ def _map_photos(
         root: Folder to create, beside the features of all photos.
         photos: Photos by name.
         masks: Pixels of each photo whose features are used.
-        files: Names of the images, in COLMAP's order.
         known_focals: Numbers of the cameras whose focal length is kept.
         threads: Number of threads for matching.
         report: Called with the completed share, from 0 to 1, and the current step.
@@ -159,19 +158,31 @@ def _map_photos(
     _begin_colmap()
     root.mkdir()
     largest = _select_features(root, masks)
-    pairs = list(combinations(files, 2))
+    pairs = list(combinations(largest, 2))
     if len(photos) > EXHAUSTIVE:
-        in_order = [f"{name}.png" for name in photos]
         chosen = overlapping_pairs([largest[name] for name in photos], lambda share: report(0.1 * share, "pairs"))
-        named = {frozenset((in_order[i], in_order[j])) for i, j in chosen}
-        pairs = [pair for pair in pairs if frozenset(pair) in named]
-    _match_features(root, pairs, threads, report)
-    model = _reconstruct(root, len(files), known_focals, report)
+        names = list(photos)
+        paired = {frozenset((names[i], names[j])) for i, j in chosen}
+        pairs = [pair for pair in pairs if frozenset(pair) in paired]
+    _match_features(root, pairs, threads, len(photos) > EXHAUSTIVE, report)
+    model = _reconstruct(root, len(photos), known_focals, report)
     if model is None or model.num_points3D() < LEAST_POINTS:
         return {}, 0
     report(0.95, "hull of the masks")
     cameras = _read_cameras(model)
-    # outlines of all objects together
+    if (overlap := _agreement_with_hulls(photos, cameras)) < LEAST_AGREEMENT:
+        words = "cameras by %d points do not move with the objects (hull against masks: %.2f)"
+        log.info(words, model.num_points3D(), overlap)
+        return {}, 0
+    return {name: cameras[name] for name in photos if name in cameras}, model.num_points3D()
+
+
+def _agreement_with_hulls(photos: Mapping[str, PhotoForMotion], cameras: Mapping[str, RegisteredCamera]) -> float:
+    """Return the overlap of a coarse hull of all objects together with their masks.
+
+    A hull is what all its masks contain, and a few wrong ones cut it. So of a larger set it is the median of hulls of
+    FEW photos.
+    """
     outlines = []
     for name, registered in sorted(cameras.items()):
         photo = photos[name]
@@ -179,25 +190,19 @@ def _map_photos(
         camera = msgspec.structs.replace(photo.camera, focal=registered.focal)
         outlines.append(Outline(name, part, camera, pose=registered.pose))
     outlines = [outline for outline in outlines if outline.is_visible]
-    # a hull is what all its masks contain: that of many is cut by a few that are wrong
     groups = max(len(outlines) // FEW, 1) if len(photos) > EXHAUSTIVE else 1
-    overlap = float(np.median([hull_overlap(outlines[k::groups]) for k in range(groups)]))
-    if overlap < LEAST_AGREEMENT:
-        words = "cameras by %d points do not move with the objects (hull against masks: %.2f)"
-        log.info(words, model.num_points3D(), overlap)
-        return {}, 0
-    return {name: cameras[name] for name in photos if name in cameras}, model.num_points3D()
+    return float(np.median([hull_overlap(outlines[k::groups]) for k in range(groups)]))
 
 
 def _extract_features(
     root: Path, photos: Mapping[str, PhotoForMotion], threads: int, report: Callable[[float, str], None]
-) -> tuple[list[str], set[int]]:
+) -> set[int]:
     """Extract SIFT features of all photos, whole, into COLMAP's database in `root`.
 
     All photos of one size, principal point and focal length share a camera; COLMAP numbers the cameras from 1.
 
     Returns:
-        Names of the images, and numbers of the cameras whose focal length is known.
+        Numbers of the cameras whose focal length is known.
     """
     _begin_colmap()
     (root / "images").mkdir()
@@ -224,7 +229,7 @@ def _extract_features(
         extraction, pycolmap.Device.cpu,
     )  # fmt: skip
     _fill_table(extract, root / DATABASE, "keypoints", lambda rows: report(0.2 * rows / len(files), "features"))
-    return files, known_focals
+    return known_focals
 
 
 def _fill_table(
@@ -246,7 +251,7 @@ def _select_features(root: Path, masks: Mapping[str, Bool[np.ndarray, "h w"]]) -
     """Write a database in `root` of the features in the masks, from that of all features beside it.
 
     Returns:
-        Descriptors of the features of the largest scales, by photo.
+        Descriptors of the features of the largest scales, by photo, in COLMAP's order.
     """
     shutil.copy(root.parent / DATABASE, root / DATABASE)
     largest = {}
@@ -269,13 +274,16 @@ def _select_features(root: Path, masks: Mapping[str, Bool[np.ndarray, "h w"]]) -
 
 
 def _match_features(
-    root: Path, pairs: Sequence[tuple[str, str]], threads: int, report: Callable[[float, str], None]
+    root: Path, pairs: Sequence[tuple[str, str]], threads: int, is_guided: bool, report: Callable[[float, str], None]
 ) -> None:
-    """Match the features of pairs of images, in one call, because COLMAP indexes an image's features anew in each."""
-    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    """Match the features of pairs of images, in one call, because COLMAP indexes an image's features anew in each.
+
+    Guided matching seeks more matches near the epipolar lines; where pairs are few, each needs them.
+    """
+    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False, guided_matching=is_guided)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
-    write_text(root / "pairs.txt", "".join(f"{one} {other}\n" for one, other in pairs))
+    write_text(root / "pairs.txt", "".join(f"{one}.png {other}.png\n" for one, other in pairs))
     pairing = pycolmap.ImportedPairingOptions(match_list_path=str(root / "pairs.txt"))
     match = partial(pycolmap.match_image_pairs, root / DATABASE, matching, pairing, verification, pycolmap.Device.cpu)
     _fill_table(match, root / DATABASE, "matches", lambda rows: report(0.1 + 0.4 * rows / len(pairs), "matches"))

@@ -155,7 +155,7 @@ def test_cameras_by_chosen_pairs_are_right_and_the_same_for_any_number_of_thread
     one, two = (cameras_by_motion(views, threads=threads) for threads in (1, 2))
     assert list(one) == list(two) == ["p0", "p1", "p2", "p3"] and "does not place p4" in caplog.text
     assert all(np.array_equal(one[n].pose.rotation, two[n].pose.rotation) for n in one)
-    assert max(turns_off(one)) < 1.0
+    assert max(turns_off(one)) < 1.5  # a pixel is 0.2°
 
 
 @pytest.mark.long
