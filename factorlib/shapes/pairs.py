@@ -30,9 +30,10 @@ def overlapping_pairs(
             report(i / photos)
         counts[i, j] = counts[j, i] = count_matches(integers[i], integers[j])
     nearest = np.argsort(-counts, axis=1, kind="stable")[:, :NEIGHBOURS]
-    is_paired = np.abs(np.subtract.outer(range(photos), range(photos))) <= ADJACENT
+    is_paired = np.zeros_like(counts, dtype=bool)
     np.put_along_axis(is_paired, nearest, True, axis=1)
-    is_paired &= (counts > 0) | (np.abs(np.subtract.outer(range(photos), range(photos))) <= ADJACENT)
+    is_paired &= counts > 0
+    is_paired |= np.abs(np.subtract.outer(range(photos), range(photos))) <= ADJACENT
     return [(i, j) for i, j in combinations(range(photos), 2) if is_paired[i, j] or is_paired[j, i]]
 
 
