@@ -93,7 +93,7 @@ class View(msgspec.Struct, frozen=True):
         )
         assert image.cam_from_world is not None  # the sources of a folder have a world
         pose = Pose(image.cam_from_world.rotation.matrix(), np.array(image.cam_from_world.translation))
-        return Outline(name, self.small.objects.astype(int), camera, pose=pose)
+        return Outline(name, self.small.objects.astype(np.int8), camera, pose=pose)
 
 
 def dataset_from_photos(
@@ -312,7 +312,7 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
     notes = [UNPLACED.format(", ".join(missing))] if missing else []
     cameras = {name: msgspec.structs.replace(photos[name].camera, focal=registered[name].focal) for name in registered}
     outlines = [
-        Outline(name, photos[name].objects.astype(int), cameras[name], pose=each.pose)
+        Outline(name, photos[name].objects.astype(np.int8), cameras[name], pose=each.pose)
         for name, each in registered.items()
     ]
     return Cameras({"sfm": True}, notes=notes, left_out=missing), outlines
@@ -383,7 +383,7 @@ def refine_mask(
     for margin in MARGINS:
         mask, doubt = mask_within(view, box, margin, network)
         objects = box_majority(mask, least_factor(mask.size, MOST_PIXELS))
-        candidate = Outline(outline.photo, objects.astype(int), outline.camera, pose=outline.pose)
+        candidate = Outline(outline.photo, objects.astype(np.int8), outline.camera, pose=outline.pose)
         if objects.any() and (overlap := agreement(candidate, others)) > best:
             best = overlap
             outline = candidate

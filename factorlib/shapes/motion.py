@@ -183,15 +183,18 @@ def _agreement_with_hulls(photos: Mapping[str, PhotoForMotion], cameras: Mapping
     A hull is what all its masks contain, and a few wrong ones cut it. So of a larger set it is the median of hulls of
     FEW photos.
     """
-    outlines = []
-    for name, registered in sorted(cameras.items()):
-        photo = photos[name]
-        part = np.where(photo.left_out, UNKNOWN, photo.objects.astype(int))
-        camera = msgspec.structs.replace(photo.camera, focal=registered.focal)
-        outlines.append(Outline(name, part, camera, pose=registered.pose))
-    outlines = [outline for outline in outlines if outline.is_visible]
-    groups = max(len(outlines) // FEW, 1) if len(photos) > EXHAUSTIVE else 1
-    return float(np.median([hull_overlap(outlines[k::groups]) for k in range(groups)]))
+    names = sorted(name for name in cameras if photos[name].objects.any())
+    groups = max(len(names) // FEW, 1) if len(photos) > EXHAUSTIVE else 1
+    overlaps = []
+    for k in range(groups):  # an outline keeps maps of distances, so only those of a group are made at once
+        outlines = []
+        for name in names[k::groups]:
+            photo = photos[name]
+            part = np.where(photo.left_out, UNKNOWN, photo.objects.astype(int))
+            camera = msgspec.structs.replace(photo.camera, focal=cameras[name].focal)
+            outlines.append(Outline(name, part, camera, pose=cameras[name].pose))
+        overlaps.append(hull_overlap([outline for outline in outlines if outline.is_visible]))
+    return float(np.median(overlaps))
 
 
 def _extract_features(
