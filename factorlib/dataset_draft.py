@@ -121,6 +121,7 @@ def new_dataset(
     """
     above = check_target(target)
     images, photo_masks, source = photos_in(photos)
+    images = {name: path for name, path in images.items() if not cameras or name not in cameras.left_out}
     beside = {} if masks else photo_masks
     mask_files = _files(masks, (*MASKS, LABELMAP), "MASKS", deep=True) if masks else sorted(beside.values())
     if beside:

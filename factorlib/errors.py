@@ -4,13 +4,17 @@ Anything wrong with a user's files or words is an `InputError`.  It states the f
 other exception is a defect of this project.
 """
 
+import re
 import unicodedata
 from collections.abc import Iterable
 from difflib import get_close_matches
 from functools import partial
 from os import PathLike
+from pathlib import PurePath
+from textwrap import shorten
 
 MOST_LISTED = 30
+MOST_ALIKE = 3  # files whose faults of one kind are listed one by one
 MOST_COMPARED = 3000
 NEAR = 0.8  # `difflib` ratio from which a word with another first letter is a suggestion
 
@@ -41,7 +45,10 @@ class InputError(ValueError):
 
 
 class InputErrors(InputError):
-    """Several faults of one input; file, key and cure are those of the first."""
+    """Several faults of one input; file, key and cure are those of the first.
+
+    A fault that many files have is stated once.
+    """
 
     def __init__(self, faults: list[InputError]):
         self.faults = faults
@@ -49,12 +56,36 @@ class InputErrors(InputError):
         super().__init__(first.fault, file=first.file, key=first.key, cure=first.cure)
 
     def __str__(self) -> str:
-        more = len(self.faults) - MOST_LISTED
-        texts = [str(fault) for fault in self.faults[:MOST_LISTED]]
+        lines = fault_lines(self.faults)
+        more = len(lines) - MOST_LISTED
+        texts = lines[:MOST_LISTED]
         return "\nerror: ".join([*texts, f"{more} more"] if more > 0 else texts)
 
     def __reduce__(self) -> tuple:
         return InputErrors, (self.faults,)
+
+
+def fault_lines(faults: Iterable[InputError]) -> list[str]:
+    """Format faults, each once; one that more than MOST_ALIKE files have but for numbers once for all of them.
+
+    >>> print(*fault_lines(InputError(f"is of {n} bits", file=f"m/{n}.jpg", cure="save it again") for n in range(4)))
+    m/0.jpg: is of 0 bits (and 3 more: 1.jpg, 2.jpg, 3.jpg)
+      save it again
+    """
+    kinds: dict[tuple, dict[str, InputError]] = {}
+    for fault in faults:
+        kinds.setdefault((re.sub(r"\d+", "", fault.fault), fault.cure), {}).setdefault(str(fault), fault)
+    lines = []
+    for texts in kinds.values():
+        first, *others = texts.values()
+        files = {str(fault.file) for fault in texts.values()}
+        if len(others) >= MOST_ALIKE and len(files) == len(texts):
+            listed = shorten(", ".join(PurePath(str(fault.file)).name for fault in others), 80, placeholder=" …")
+            words = f"{first.fault} (and {len(others)} more: {listed})"
+            lines.append(str(InputError(words, file=first.file, key=first.key, cure=first.cure)))
+        else:
+            lines += texts
+    return lines
 
 
 def raise_all(faults: list[InputError]) -> None:

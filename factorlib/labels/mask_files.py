@@ -2,7 +2,8 @@
 
 Pillow reads pictures, because it alone keeps the stored values: palette indices of a PNG, not the palette's colours. It
 stretches grey of 2 or 4 bits to 8 bits, which is undone. Pictures are turned as EXIF says. Lossy formats (JPEG, most
-WebP) change values by some codes: they can be silhouettes, but hold no labels.
+WebP) change values by some codes, and by more in blocks about edges: they can be silhouettes, but hold no labels. A
+lossy picture is a silhouette if all pixels are black or white to RINGING codes, but a share of MOST_SOFT at its edges.
 
 The file of labelme becomes COCO's; its masks of pixels become RLE. Label Studio and Roboflow change the names of
 photos, which is undone. A polygon of fewer than three corners is empty.
@@ -26,6 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt16
 from PIL import Image, ImageOps
 from pycocotools import mask as pycocomask
+from scipy import ndimage
 
 from factorlib.dataset.paths import nearest_paths, plain_path
 from factorlib.dataset.schema import LEFT_OUT
@@ -36,6 +38,7 @@ FORMATS = ["PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "TGA"]  # Pillow's names
 MODES = ("1", "L", "P", "LA", "RGB", "RGBA", "I;16", "I;16B")  # Pillow's modes whose values are read as they are
 RINGING = 32  # greatest error of a lossy format, codes
 MOST_SOFT = 0.25  # greatest share of pixels between black and white in a lossy silhouette, of the white ones
+BLOCK = 16  # side of a JPEG's blocks where colours have half the resolution, pixels: errors of an edge reach no farther
 Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; a mask has the size of its photo, which is limited
 OVERSHOOT = 2.0  # a polygon may leave the image by this many pixels
 MOST_BYTES = 512_000_000  # greatest size of a file; a hundred thousand outlines take half of it
@@ -206,11 +209,14 @@ def _decode(path: str | Path, key: str, size: tuple[int, int] | None) -> _Pictur
 
 
 def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
-    """Return the values of a decoded picture; if it is lossy, 0 and 255, which it must be near."""
+    """Return the values of a decoded picture; if it is lossy, 0 and 255, which it must be near but about edges."""
     values = _values(picture, path, key)
     if picture.lossy:
-        white = np.count_nonzero(values >= LEFT_OUT - RINGING)
-        if values.any() and np.count_nonzero(values > RINGING) >= (1 + MOST_SOFT) * white:
+        white = values >= LEFT_OUT - RINGING
+        soft = (values > RINGING) & ~white
+        # a label between black and white fills more than what the errors of two edges, on either side, reach
+        is_label = ndimage.minimum_filter(soft, 2 * BLOCK + 1, mode="nearest").any()
+        if values.any() and (is_label or np.count_nonzero(soft) >= MOST_SOFT * np.count_nonzero(white)):
             raise InputError(
                 "is of a lossy format, which changes labels",
                 file=path,
@@ -222,7 +228,10 @@ def _exact_values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.nd
 
 
 def _values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
-    """Return the stored values of a decoded picture; InputError for colours and transparency."""
+    """Return the stored values of a decoded picture; InputError for colours and transparency.
+
+    Of a lossy picture some pixels at the edges may have colours; their value is the mean of the channels.
+    """
     values = picture.pixels
     if values.ndim == 3:
         if ";16" in picture.raw:  # Pillow keeps only the upper byte
@@ -233,14 +242,15 @@ def _values(picture: _Picture, path: str | Path, key: str) -> UInt16[np.ndarray,
             raise InputError("has transparent pixels", file=path, key=key, cure=cure)
         colours = values[..., : 1 if values.shape[-1] == 2 else 3]
         coloured = np.ptp(colours, axis=-1) > (RINGING if picture.lossy else 0)
-        if coloured.any():
+        white = np.count_nonzero(colours.min(axis=-1) >= LEFT_OUT - RINGING) if picture.lossy else 0
+        if np.count_nonzero(coloured) > MOST_SOFT * white:
             raise InputError(
                 f"is a colour picture (one pixel is {tuple(colours[coloured][0].tolist())})",
                 file=path,
                 key=key,
                 cure="save labels in one channel: 0 background, k for the k-th material, 255 leave out",
             )
-        values = colours[..., 0]
+        values = colours.sum(axis=-1, dtype=np.uint16) // colours.shape[-1]
     return (values // {"L;2": 85, "L;4": 17}.get(picture.raw, 1)).astype(np.uint16)  # the code of 1 in stretched grey
 
 

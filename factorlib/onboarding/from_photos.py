@@ -22,7 +22,7 @@ from factorlib.dataset.paths import Refusal
 from factorlib.dataset.sources.external_cameras import READERS, match_images
 from factorlib.dataset.sources.source_image import GRID, SourceImage
 from factorlib.dataset_draft import check_target, new_dataset, photos_in
-from factorlib.errors import InputError
+from factorlib.errors import InputError, raise_all
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.images.photo import box_majority, decode_photo, least_factor, open_photo
 from factorlib.images.picture import picture, write_png
@@ -55,6 +55,10 @@ SHAPE = (
 REVOLVED = (
     "every mask looks like a body of revolution, so `lathe: true` is written: if it is none, write "
     "`primitive: ball | box | cylinder` or `file: <mesh>` instead"
+)
+UNPLACED = (
+    "left out, for structure from motion does not place them: {}; they are blurred, turned, or of another thing, or no "
+    "photo overlaps with them: add photos between them and the others, each 10 to 20° from the next"
 )
 NAMES = "rename materials and meshes in dataset.yaml now, if at all: another name later makes all steps run again"
 
@@ -90,7 +94,7 @@ class View(msgspec.Struct, frozen=True):
         )
         assert image.cam_from_world is not None  # the sources of a folder have a world
         pose = Pose(image.cam_from_world.rotation.matrix(), np.array(image.cam_from_world.translation))
-        return Outline(name, self.small.objects.astype(int), camera, pose=pose)
+        return Outline(name, self.small.objects.astype(np.int8), camera, pose=pose)
 
 
 def dataset_from_photos(
@@ -121,6 +125,9 @@ def dataset_from_photos(
             cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
         elif not meshes:
             cameras, outlines = cameras_of_motion(visible, report)
+            for name in cameras.left_out:
+                del views[name], visible[name]
+                (folder / "masks" / f"{name}.png").unlink()
         views, outlines = refine_masks(
             views, outlines, model, folder, lambda share, text: report(0.9 + share / 20, text)
         )
@@ -133,7 +140,8 @@ def dataset_from_photos(
                 lambda share: report(0.95 + share / 20, "parts by colour"),
             )  # fmt: skip
         if unknown := not cameras.source and not meshes:
-            cameras = outlined_shape(visible, report)
+            shape = outlined_shape(visible, report)
+            cameras = shape if shape.revolved else cameras
         missing = new_dataset(target, photos, folder / "masks", meshes, cameras)
     return missing + [SHAPE] * (unknown and not cameras.revolved), [
         NAMES,
@@ -156,25 +164,33 @@ def read_views(
         folder: a temporary folder
         report: called with the completed share and the current activity
 
-    Raises InputError if a photo needs a network that is not installed, or if no photo has a foreground.
+    Raises InputError if masks cannot be read, of all of them together, if a photo needs a network that is not
+    installed, or if no photo has a foreground.
     """
     views: dict[str, View] = {}
+    faults: list[InputError] = []
     network = None
     (folder / "masks").mkdir()
     for name, path in images.items():
         report(len(views) / len(images), f"{name}: mask")
         opened = open_photo(path, "PHOTOS")
         check_pixels(opened.size, MOST_MEGAPIXELS, path, "PHOTOS")
+        mask = None
+        if file := masks.get(name):
+            try:
+                labels = list(read_labels_in(file, "PHOTOS", opened.size))
+                mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
+            except InputError as fault:
+                faults.append(fault)
+        if faults:
+            continue
         photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), path)
         pixels = picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
         uncertain = 0.0
         matted = None
-        if file := masks.get(name):
-            labels = list(read_labels_in(file, "PHOTOS", opened.size))
-            mask = np.isin(read_values(file, "PHOTOS"), labels) if labels else read_inside(file, "PHOTOS")
-        elif (opaque := opaque_pixels(path)) is not None:
-            mask = opaque
-        else:
+        if mask is None:
+            mask = opaque_pixels(path)
+        if mask is None:
             network = network or MatteModel(model)
             matted = pixels
             matte, uncertain = network(pixels, opened.size)
@@ -185,6 +201,7 @@ def read_views(
         prior = with_prior_focal(camera, photo.focal_px, "exif")
         small = PhotoForMotion(pixels.mean(axis=2).astype(np.uint8), objects, np.zeros_like(objects), *prior)
         views[name] = View(small, opened.size, uncertain, matted, describe_specks(mask))
+    raise_all(faults)
     if not any(view.small.objects.any() for view in views.values()):
         cure = "draw masks: `make new`, then `make label`"
         raise InputError("no photo has a foreground", file=path.parent, key="PHOTOS", cure=cure)
@@ -282,7 +299,9 @@ def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
 
 
 def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Cameras, list[Outline]]:
-    """Return the source `sfm`, and outlines by its cameras; no source where photos do not overlap.
+    """Return the source `sfm`, and outlines by its cameras; no source where photos do not overlap, but what would help.
+
+    Photos that are not placed are left out, if they are fewer than the others.
 
     Args:
         views: the photos with a foreground
@@ -291,14 +310,16 @@ def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Camera
     photos = {name: view.small for name, view in views.items()}
     try:
         registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.4 * share, text))
-    except InputError:
-        return Cameras(), []
+    except InputError as error:
+        return Cameras(notes=[f"{error.fault}: {error.cure}"]), []
+    missing = [name for name in photos if name not in registered] if 2 * len(registered) > len(photos) else []
+    notes = [UNPLACED.format(", ".join(missing))] if missing else []
     cameras = {name: msgspec.structs.replace(photos[name].camera, focal=registered[name].focal) for name in registered}
     outlines = [
-        Outline(name, photos[name].objects.astype(int), cameras[name], pose=each.pose)
+        Outline(name, photos[name].objects.astype(np.int8), cameras[name], pose=each.pose)
         for name, each in registered.items()
     ]
-    return Cameras({"sfm": True}), outlines
+    return Cameras({"sfm": True}, notes=notes, left_out=missing), outlines
 
 
 def outlined_shape(views: Mapping[str, View], report: Report) -> Cameras:
@@ -366,7 +387,7 @@ def refine_mask(
     for margin in MARGINS:
         mask, doubt = mask_within(view, box, margin, network)
         objects = box_majority(mask, least_factor(mask.size, MOST_PIXELS))
-        candidate = Outline(outline.photo, objects.astype(int), outline.camera, pose=outline.pose)
+        candidate = Outline(outline.photo, objects.astype(np.int8), outline.camera, pose=outline.pose)
         if objects.any() and (overlap := agreement(candidate, others)) > best:
             best = overlap
             outline = candidate

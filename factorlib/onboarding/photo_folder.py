@@ -44,6 +44,7 @@ class Cameras(msgspec.Struct):
         files: its files, to be copied to cameras/ as they lie in the folder
         by_photo: further keys of photos in dataset.yaml
         notes: assumptions, in words
+        left_out: names of photos that the dataset does without
         revolved: True if no source is known, and every mask looks like a body of revolution
     """
 
@@ -52,6 +53,7 @@ class Cameras(msgspec.Struct):
     files: list[Path] = []
     by_photo: dict[str, dict[str, Any]] = {}
     notes: list[str] = []
+    left_out: list[str] = []
     revolved: bool = False
 
 

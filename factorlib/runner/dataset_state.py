@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from factorlib.errors import InputError
+from factorlib.errors import InputError, fault_lines
 from factorlib.jsonfile import json_text
 from factorlib.runner.plan import Listing, PlannedStep, Record, Spec, Step, plan
 from factorlib.runner.project import (
@@ -87,7 +87,7 @@ class DatasetState:
         return StageCode(*place, stage.values, self.project.pipeline_file, stage.threads, cores)
 
     def file_faults(self, steps: Iterable[Step]) -> list[str]:
-        """List the faults of the files that steps and their recipes read, each once."""
+        """List the faults of the files that steps and their recipes read, each once, one of many files once for all."""
         faults: list[InputError] = []
         requests = []
         for step in steps:
@@ -95,7 +95,7 @@ class DatasetState:
             faults += self.data.recipe_faults(self.recipes[step.recipe].files) if step.recipe is not None else []
             requests += [(slice_, step.photo, stage.values, self.project.pipeline_file) for slice_ in stage.slices]
         faults += self.data.faults(requests) if requests else []
-        return list(dict.fromkeys(map(str, faults)))
+        return fault_lines(faults)
 
     def parameter_faults(self, planned: list[PlannedStep]) -> list[str]:
         """List the faults of the parameters of steps that are not current.

@@ -408,8 +408,7 @@ def _start_process(run: Path | None, threads: int) -> ProcessPoolExecutor:
 
 def _begin_process(run: Path | None) -> None:
     """Begin a process: it ignores signals, and ends with its parent or with its run."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))  # COLMAP replaces a handler, not this
     parent = multiprocessing.parent_process()
 
     def end_with_parent_and_run() -> None:

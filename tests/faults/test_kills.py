@@ -6,6 +6,7 @@ The same holds of what changes or is damaged meanwhile, and of a disk without ro
 
 import contextlib
 import json
+import multiprocessing
 import os
 import random
 import resource
@@ -15,12 +16,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.results_folder import collect, verify
+from factorlib.runner.worker import _begin_process
 from tests.runner import toy
 from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
 
@@ -225,6 +228,13 @@ def test_sigterm_prints_no_stack_after_files_were_validated():
     )
     process = subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, capture_output=True, text=True)
     assert process.returncode == -signal.SIGTERM and not process.stderr
+
+
+def test_a_worker_ignores_signals_also_once_colmap_has_its_own_handler(capfd):
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context, _begin_process, (None,)) as pool:
+        pool.submit(exec, "import os, signal, pycolmap; os.kill(os.getpid(), signal.SIGTERM)").result()
+    assert not capfd.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -12,7 +12,7 @@ from pycocotools import mask as pycocomask
 from factorlib.images.picture import png_bytes
 from factorlib.labels.grow import grow
 from factorlib.labels.label_image import Labels, check_materials, describe_specks, read_labels, read_object_indices
-from factorlib.labels.mask_files import read_labels_in, run_lengths
+from factorlib.labels.mask_files import read_inside, read_labels_in, read_values, run_lengths
 from tests.refusal import refusal
 
 MATERIALS = ["red", "white", "wood"]
@@ -156,6 +156,27 @@ def test_forty_labels_are_labels_and_a_soft_matte_has_none(tmp_path):
         assert read_labels_in(tmp_path / save(tmp_path / "a.png", values, exif=TURNED), KEY) == set(range(1, 40))
     for matte in (np.linspace(0, 255, H * W).reshape(H, W).astype(np.uint8), many * 1600):
         assert read_labels_in(tmp_path / save(tmp_path / "a.png", matte), KEY) == set()
+
+
+DISC = np.hypot(*(np.indices((240, 320)) - [[[120]], [[140]]])) < 80
+
+
+@pytest.mark.parametrize("quality, chroma", [(90, 2), (60, 2), (95, 0)])
+def test_a_jpeg_of_two_values_is_a_mask_also_with_colours_at_its_edges(tmp_path, quality, chroma):
+    rim = np.indices(DISC.shape)[1] > 218  # the disc's last pixels are orange: of another program's soft brush
+    picture = np.dstack([DISC * np.uint8(255), DISC * np.where(rim, 160, 255), DISC * np.where(rim, 60, 255)])
+    file = tmp_path / save(tmp_path / "a.jpg", picture.astype(np.uint8), quality=quality, subsampling=chroma)
+    assert read_labels_in(file, KEY) == set()
+    inside = read_inside(file, KEY)
+    assert (inside != DISC).mean() < 0.002 and np.array_equal(read_values(file, KEY) == 255, inside)
+
+
+@pytest.mark.parametrize("quality", [60, 95])
+def test_a_jpeg_of_three_values_is_refused_however_small_the_third_is_beside_the_first(tmp_path, quality):
+    values = np.where(DISC, 255, 0).astype(np.uint8)
+    values[10:60, 250:300] = 130
+    file = tmp_path / save(tmp_path / "a.jpg", values, quality=quality)
+    assert "save labels as PNG" in refusal("is of a lossy format", read_labels_in, file, KEY).cure
 
 
 def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():

@@ -26,6 +26,7 @@ from factorlib.onboarding.matte import MatteModel, doubt, foreground, opaque_pix
 from factorlib.onboarding.photo_folder import Cameras, read_photo_folder
 from factorlib.scenes.stage_runs import CHECKOUT
 from factorlib.shapes.hull import focal_by_hull
+from factorlib.shapes.motion import RegisteredCamera
 from factorlib.validation import Validation
 from tests.faults.sample import put
 from tests.images.test_photo import save
@@ -77,9 +78,21 @@ def test_without_cameras_outlines_tell_whether_the_thing_is_a_body_of_revolution
         cut_out(tmp_path / "photos" / f"{number}.png", rasterise(SHAPES[body](), CAMERA, POSES[number]).label > 0)
     missing, notes = dataset_from_photos(tmp_path / "mine", tmp_path / "photos", None, None, lambda share, text: None)
     assert (SHAPE in missing, REVOLVED in notes) == (not revolved, revolved)
+    assert any("each 10 to 20° from the next" in note for note in notes) == (not revolved)
     if revolved:
         dataset = read_dataset(tmp_path / "mine")
         assert dataset.spec.meshes["thing"].lathe and Validation(dataset).faults([("photo", None, {}, tmp_path)]) == []
+
+
+def test_photos_that_structure_from_motion_does_not_place_are_named_and_left_out(cut_outs, monkeypatch):
+    cameras = {name: RegisteredCamera(CAMERA.focal, POSES[int(name)]) for name in "012346"}
+    monkeypatch.setattr("factorlib.onboarding.from_photos.cameras_by_motion", lambda photos, report: cameras)
+    missing, notes = dataset_from_photos(
+        cut_outs / "mine", cut_outs / "capture" / "images", None, None, lambda share, text: None, whole=True
+    )
+    names = sorted(path.stem for path in (cut_outs / "mine" / "photos").iterdir())
+    assert missing == [] and names == list(cameras) and any("place them: 5, 7;" in note for note in notes)
+    assert [photo.name for photo in read_dataset(cut_outs / "mine").spec.photos] == names
 
 
 def brightest(pixels, size):
@@ -184,6 +197,17 @@ def test_a_mask_beside_a_photo_is_its_labels_or_a_matte_cut_at_half(tmp_path, to
         shutil.rmtree(tmp_path / "masks", ignore_errors=True)
         read_views({"a": tmp_path / "a.jpg"}, {"a": tmp_path / "a_mask.png"}, None, tmp_path, lambda share, text: None)
         assert np.asarray(Image.open(tmp_path / "masks" / "a.png")).tolist() == [inside] * 2
+
+
+def test_masks_that_cannot_be_read_are_named_in_one_error(tmp_path):
+    names = [f"p{number}" for number in range(6)]
+    for name in names:
+        Image.fromarray(np.zeros((40, 60, 3), np.uint8)).save(tmp_path / f"{name}.jpg")
+        values = np.repeat([0, 130, 255], 20).astype(np.uint8)
+        Image.fromarray(np.tile(values, (40, 1))).save(tmp_path / f"{name}_mask.jpg")
+    images, masks = ({name: tmp_path / f"{name}{end}.jpg" for name in names} for end in ("", "_mask"))
+    error = refusal("is of a lossy format", read_views, images, masks, None, tmp_path, lambda share, text: None)
+    assert str(error).count("save labels as PNG") == 1 and "(and 5 more: p1_mask.jpg, p2_mask.jpg" in str(error)
 
 
 def test_a_photo_without_alpha_prints_nothing_and_one_that_hides_nothing_has_none(tmp_path, capfd):
