@@ -81,11 +81,19 @@ def test_the_solve_keeps_suns_of_lights_that_have_one():
 
 
 @pytest.mark.parametrize(
-    "colour, share, kept", [((3, 2, 1), 0.2, True), ((1, 2, 3), 0.2, False), ((3, 2, 1), 0.02, False)]
+    "colour, share, margin, kept",
+    [
+        ((3, 2, 1), 0.2, 9.0, True),
+        ((1, 2, 3), 0.2, 9.0, False),  # bluer than the rest
+        ((3, 2, 1), 0.02, 9.0, False),  # weak
+        ((3, 2, 1), 0.2, -1.5, True),  # sunlight, which hard shadows of a wrong mesh contradict a little
+        ((3, 2, 1), 0.2, -2.5, False),
+        ((1, 1, 1), 0.2, -1.5, False),  # a lamp
+    ],
 )
-def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share, kept):
+def test_a_sun_is_strong_and_no_bluer_than_its_light_and_kept_in_sunlight(monkeypatch, colour, share, margin, kept):
     """Whatever the observations say."""
-    monkeypatch.setattr(suns, "compare_illuminations", lambda *_: Decision(True, 1.0, 2.0, 9.0))
+    monkeypatch.setattr(suns, "compare_illuminations", lambda cells, sun, least: Decision(margin > least, 1, 2, margin))
     one = solved(0.0, 1)[2]
     total = one.light.energy.sum() / lobe_energy(np.array([SUN]))[0]
     weight = total * share * np.array(colour) / sum(colour)
