@@ -3,10 +3,10 @@
 The sun's disc is half a degree wide and holds a quarter to two thirds of the light where it shines.  Cells spread that
 energy over all directions that the observations cannot distinguish, ten degrees and more.  An object in such a light
 has no crisp shadow.  The observations determine direction and energy far better than width, and the width of the sun is
-known.  Three lights are therefore compared: cells alone, cells with a sun, and, if that is accepted, cells with a wide
-lobe in its place (`replace_brightest`).  In the latter two, cells within `DISC_RADIUS` of the brightest direction take
-the radiance of their surroundings, and one lobe is added.  The lobe is as narrow as the sun, or as wide
-(`WIDE_SHARPNESS`) as a window or a lamp.  Its direction z and its weight w ≥ 0 minimise
+known.  Three lights are therefore compared: cells alone, cells with a sun, and, if that is accepted and is not
+sunlight, cells with a wide lobe in its place (`replace_brightest`).  In the latter two, cells within `DISC_RADIUS` of
+the brightest direction take the radiance of their surroundings, and one lobe is added.  The lobe is as narrow as the
+sun, or as wide (`WIDE_SHARPNESS`) as a window or a lamp.  Its direction z and its weight w ≥ 0 minimise
 
     Σ_i t_i² (r_i + A_i(z) w)²                                                                                       (1)
 
@@ -14,11 +14,10 @@ channel by channel, with t² the weight of the robust loss (0 where clipped and 
 The residual is linear in w; z is searched over grids, coarse and then fine.  Then cells are fitted anew, around either
 lobe and alone; a sun that gains too little in one step is not fitted further.  The sun is kept if its light explains
 the observations better than cells alone, holds a share of the light, and is no bluer than the rest (`accept_sun`): air
-scatters blue light from the sun into the sky.  Where it is much redder than the rest, light is sunlight, and the sun is
-kept unless the evidence is clearly against it: on a hull, hard shadows lie beside the true ones, and softer light
-explains photographs about as well.  Natural light has suns, so the comparison with the wide lobe rejects one
-only if the evidence is clearly against it (`CLEARLY_AGAINST`).  All observations decide, not the held-out ones alone: a
-sun has five unknowns and replaces those of dozens of cells, so it hardly overfits.
+scatters blue light from the sun into the sky.  Where it is much redder than the rest (`SUNLIGHT`), it is kept unless
+the evidence is clearly against it: on a hull, hard shadows lie beside the true ones, and softer light explains
+photographs as well.  A lamp is replaced by the wide lobe only if that is clearly better.  All observations decide, not
+the held-out ones alone: a sun has five unknowns and replaces those of dozens of cells, so it hardly overfits.
 """
 
 from __future__ import annotations
@@ -95,19 +94,21 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
         changed = list(kept)
         if not kept:
             return Selection(fit, evidence)
-    # a wide lobe in place of each accepted sun
+    # a wide lobe in place of each accepted lamp
+    lamps = [k for k, sun in kept.items() if warmth(sun[0].light) < SUNLIGHT]
     replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
-    wide = fit_anew(changed, list(problem.spread(replace_widely, [without_suns[k] for k in changed])))
+    wide = fit_anew(lamps, list(problem.spread(replace_widely, [without_suns[k] for k in lamps]))) if lamps else []
+    for k, with_wide_lobe in zip(lamps, wide, strict=True):
+        decision = compare_illuminations(with_wide_lobe[0], kept[k][0], CLEARLY_AGAINST)
+        if not decision.accepted:
+            evidence[k] = decision
+            del kept[k]
     lights = list(fit.point.lights)
     hyperparameters = list(fit.hyperparameters)
     status = list(fit.status)
-    for (k, sun), with_wide_lobe in zip(kept.items(), wide, strict=True):
-        decision = compare_illuminations(with_wide_lobe[0], sun[0], CLEARLY_AGAINST)
-        if decision.accepted:
-            illumination, hyperparameters[k], status[k] = sun
-            lights[k] = illumination.light
-        else:
-            evidence[k] = decision
+    for k, sun in kept.items():
+        illumination, hyperparameters[k], status[k] = sun
+        lights[k] = illumination.light
     fit = msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters, status=status)
     return Selection(fit, evidence)
 
@@ -172,19 +173,23 @@ def accept_sun(cells: Illumination, sun: Illumination, share: float = 1.0) -> De
         sun: Observations in the light with a sun.
         share: Factor on the thresholds.
     """
-    energy = sun.light.energy[sun.light.suns].sum(0)
-    total = sun.light.energy.sum(0)
-    strong = energy.sum() >= share * LEAST_SUN_SHARE * total.sum()
-    # red over blue, relative to the rest of the light
-    warmth = np.diff(np.log(np.maximum([total - energy, energy], TINY))[:, [2, 0]]).ravel()
-    warmer = float(warmth[1] - warmth[0])
-    if warmer >= SUNLIGHT:
+    light = sun.light
+    strong = light.energy[light.suns].sum() >= share * LEAST_SUN_SHARE * light.energy.sum()
+    if warmth(light) >= SUNLIGHT:
         evidence = compare_illuminations(cells, sun, CLEARLY_AGAINST)
         accepted = evidence.accepted
     else:
         evidence = compare_illuminations(cells, sun, share * WEAKLY_FOR)
-        accepted = evidence.accepted and gains(evidence, share * LEAST_SUN_GAIN) and warmer >= 0
+        accepted = evidence.accepted and gains(evidence, share * LEAST_SUN_GAIN) and warmth(light) >= 0
     return msgspec.structs.replace(evidence, accepted=bool(accepted and strong))
+
+
+def warmth(light: Light) -> float:
+    """Return the logarithm of the ratio of red over blue of a light's suns, less that of the rest."""
+    suns = light.energy[light.suns].sum(0)
+    by_part = np.log(np.maximum([light.energy.sum(0) - suns, suns], TINY))
+    rest, own = by_part[:, 0] - by_part[:, 2]
+    return float(own - rest)
 
 
 def _grid_around(z: Float[np.ndarray, "3"], radius: float, step: float) -> Float[np.ndarray, "q 3"]:
