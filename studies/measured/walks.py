@@ -45,7 +45,7 @@ from studies.measured.tools import ROOT, evaluate_dataset, machine, markdown_tab
 PLACE = ROOT / "build/bench/walks"
 PHOTOS = 12
 SIZE = 512  # pixels of a side
-FOCAL = 1300.0
+FOCAL = 1000.0
 DISTANCE = 2.6  # of the camera, in extents of the solid
 CLIPPED = 0.005  # share of the thing's pixels whose brightest channel is clipped
 SAMPLES = 64
@@ -134,6 +134,7 @@ def generate_walk(name: str, folders: Sequence[Path]) -> Path:
     walk = WALKS[name]
     light = light_map(walk.light, folders)
     mesh = walk.solid()
+    mesh = msgspec.structs.replace(mesh, vertices=mesh.vertices - (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2)
     if walk.painted:
         mesh = painted_mesh(mesh, walk.painted)
     unfinished = folder.with_suffix(".new")
