@@ -19,11 +19,13 @@ import xatlas
 from jaxtyping import Float, Int, UInt8
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 
 from factorlib.export.simplification import Surface, simplify
 from factorlib.geometry import open3d as o3d
 from factorlib.images.tone import srgb_encode
 from factorlib.meshes.mesh import Mesh, area_vectors, weld_vertices
+from factorlib.robust import TINY
 
 GUTTER = 4  # least number of texels between charts
 SMALLEST = 64  # least width and height of an image
@@ -120,7 +122,7 @@ def unwrap(mesh: Mesh, size: int) -> tuple[Mesh, float, int]:
     faces = index.reshape(-1, 3).astype(np.int32)
     result = Mesh(mesh.vertices[vertex], faces, mesh.normals[vertex], mesh.face_label, mesh.open, uv=uv[first])
     areas = [np.linalg.norm(area_vectors(points, faces), axis=1) for points in (result.vertices, _flat(result))]
-    length = np.sqrt(areas[0] / np.maximum(areas[1], 1e-300))
+    length = np.sqrt(areas[0] / np.maximum(areas[1], TINY))
     order = np.argsort(length)
     coarse = np.searchsorted(np.cumsum(areas[0][order]), COARSE * areas[0].sum())
     return result, float(length[order[coarse]]), least
@@ -149,14 +151,16 @@ def _fewest_charts(
     average = csr_array(diags_array(1 / np.maximum(np.asarray(graph.sum(axis=1)).reshape(-1), 1)) @ graph)
     noise = np.random.default_rng(0).normal(0, ROUGHNESS, places.shape)
     fewest = len(faces) + MOST_CHARTS + 1
+    piece = connected_components(graph, directed=False)[1]
     smooth = places
     for step in range(1, 1 + max(SMOOTHING)):
         smooth = (smooth + average @ smooth) / 2
         if step not in SMOOTHING or fewest <= MOST_CHARTS:
             continue
-        area = np.linalg.norm(area_vectors(smooth, faces), axis=1).mean()
+        bodies = _as_large(smooth, places, piece)
+        area = np.linalg.norm(area_vectors(bodies, faces), axis=1).mean()
         atlas = xatlas.Atlas()
-        atlas.add_mesh((smooth / max(area, LEAST_AREA) ** 0.5 + noise).astype(np.float32), faces.astype(np.uint32))
+        atlas.add_mesh((bodies / max(area, LEAST_AREA) ** 0.5 + noise).astype(np.float32), faces.astype(np.uint32))
         charts = xatlas.ChartOptions()
         charts.max_cost = MOST_COST
         packing = xatlas.PackOptions()
@@ -168,6 +172,25 @@ def _fewest_charts(
             fewest, width = atlas.chart_count, max(atlas.width, atlas.height)
             result = uv[index].reshape(-1, 2).astype(np.float32)
     return result, min(width, LARGEST)
+
+
+def _as_large(
+    smooth: Float[np.ndarray, "v 3"], places: Float[np.ndarray, "v 3"], piece: Int[np.ndarray, " v"]
+) -> Float[np.ndarray, "v 3"]:
+    """Return smoothed vertices with each connected piece as large as before: smoothing shrinks small ones to points.
+
+    Args:
+        smooth: vertices after smoothing
+        places: vertices before it
+        piece: number of each vertex's piece
+    """
+    count = np.bincount(piece)[:, None]
+    offsets = [
+        points - (np.column_stack([np.bincount(piece, column) for column in points.T]) / count)[piece]
+        for points in (places, smooth)
+    ]
+    before, after = (np.bincount(piece, np.square(offset).sum(axis=1)) for offset in offsets)
+    return places - offsets[0] + np.sqrt(before / np.maximum(after, TINY))[piece, None] * offsets[1]
 
 
 def _texel_places(mesh: Mesh, size: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "s s"]]:

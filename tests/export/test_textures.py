@@ -97,6 +97,7 @@ def test_surfaces_that_are_no_manifold_and_many_parts_are_laid_out():
     for vertices, faces in (
         (np.vstack([np.zeros(3), np.eye(3), [0, -1, 0]]), np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])),
         (np.vstack([b.vertices for b in balls]), np.vstack([b.faces + 42 * k for k, b in enumerate(balls)])),
+        (np.random.default_rng(0).normal(size=(300, 3)), np.arange(300).reshape(100, 3)),  # loose triangles
     ):
         mesh = smooth(vertices, faces)
         atlas = make_atlas([mesh], mesh, 0.01 * np.ptp(vertices, axis=0).max())
