@@ -14,8 +14,8 @@ channel by channel, with t² the weight of the robust loss (0 where clipped and 
 The residual is linear in w; z is searched over grids, coarse and then fine.  Then cells are fitted anew, around either
 lobe and alone; a sun that gains too little in one step is not fitted further.  The sun is kept if its light explains
 the observations better than cells alone, holds a share of the light, and is no bluer than the rest (`accept_sun`): air
-scatters blue light from the sun into the sky.  Where it is much redder than the rest (`SUNLIGHT`), it is kept unless
-the evidence is clearly against it: on a hull, hard shadows lie beside the true ones, and softer light explains
+scatters blue light from the sun into the sky.  Where it is strong and redder than the rest (`is_sunlight`), it is kept
+unless the evidence is clearly against it: on a hull, hard shadows lie beside the true ones, and softer light explains
 photographs as well.  A lamp is replaced by the wide lobe only if that is clearly better.  All observations decide, not
 the held-out ones alone: a sun has five unknowns and replaces those of dozens of cells, so it hardly overfits.
 """
@@ -51,9 +51,9 @@ GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))
 # and 13, true suns hold 9 % of the light or more and lower the loss by 1.2 to 15 %.
 LEAST_SUN_GAIN = 0.01
 LEAST_SUN_SHARE = 0.07
-# Least logarithm of a sun's ratio of red over blue, over that of the rest of its light.  Of 33 captured maps the eight
-# with a sun have .26 to 1.5; other lights whose brightest 15° hold a quarter of the energy have .05 at most.
-SUNLIGHT = 0.25
+# Least sum of a sun's share of the light and of its warmth, in sunlight.  Of 33 captured maps and the six lights of
+# data/eames those with a sun have .9 and more, by their brightest 15°; the others have .66 at most.
+SUNLIGHT = 0.8
 ONE_STEP = FitSchedule(light_steps=1, materials_fixed=True)
 AROUND_SUNS = FitSchedule(
     descents=(0, 2), least_temperature=0.1, temperature_factor=LIGHT_TEMPERATURE, materials_fixed=True
@@ -95,7 +95,7 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
         if not kept:
             return Selection(fit, evidence)
     # a wide lobe in place of each accepted lamp
-    lamps = [k for k, sun in kept.items() if warmth(sun[0].light) < SUNLIGHT]
+    lamps = [k for k, sun in kept.items() if not is_sunlight(sun[0].light)]
     replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
     wide = fit_anew(lamps, list(problem.spread(replace_widely, [without_suns[k] for k in lamps]))) if lamps else []
     for k, with_wide_lobe in zip(lamps, wide, strict=True):
@@ -174,14 +174,24 @@ def accept_sun(cells: Illumination, sun: Illumination, share: float = 1.0) -> De
         share: Factor on the thresholds.
     """
     light = sun.light
-    strong = light.energy[light.suns].sum() >= share * LEAST_SUN_SHARE * light.energy.sum()
-    if warmth(light) >= SUNLIGHT:
+    if is_sunlight(light, share):
         evidence = compare_illuminations(cells, sun, CLEARLY_AGAINST)
         accepted = evidence.accepted
     else:
         evidence = compare_illuminations(cells, sun, share * WEAKLY_FOR)
         accepted = evidence.accepted and gains(evidence, share * LEAST_SUN_GAIN) and warmth(light) >= 0
+    strong = sun_share(light) >= share * LEAST_SUN_SHARE
     return msgspec.structs.replace(evidence, accepted=bool(accepted and strong))
+
+
+def is_sunlight(light: Light, share: float = 1.0) -> bool:
+    """Return True if the colour and the share of a light's suns are those of the sun, by `share` of the threshold."""
+    return sun_share(light) + warmth(light) >= share * SUNLIGHT
+
+
+def sun_share(light: Light) -> float:
+    """Return the share of a light's energy that its suns hold."""
+    return float(light.energy[light.suns].sum() / light.energy.sum())
 
 
 def warmth(light: Light) -> float:

@@ -106,7 +106,7 @@ class PaintRange(msgspec.Struct, frozen=True):
     """Brightest paint of a material, as it was estimated.
 
     Attributes:
-        brightest: k_d times the factor plus max k_s, which all but a thousandth of the painted surface is below
+        brightest: k_d times the factor plus max k_s, which all but 2 % of the painted surface is below
         above: share of the painted surface where that sum exceeds 1
     """
 
