@@ -14,6 +14,11 @@ Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`.  A brigh
        the light, as in most photographs of objects, and Mitsuba requires a value below one.  Interreflection and
        surroundings determine a scale to about a quarter of itself only.  Where a reflectance exceeds 1 at it, which no
        surface has, the component takes this scale, too, at its own tint.
+
+Bounces  Interreflection alone determines the factors badly: on a hull, light from hidden surfaces comes from wrong
+       places (a white box in the sun came out at .2, and red).  So logarithms of factors are means of those and of the
+       prior's, weighted by their variances: `BOUNCE_DEVIATION`², that of mean tints of natural lights, and that of the
+       brightness of the brightest material.
 """
 
 from __future__ import annotations
@@ -32,6 +37,11 @@ from factorlib.inference.materials import Materials, Point
 from factorlib.robust import TINY
 
 BRIGHTEST = 0.9
+# Median of the mean reflectance of a set's brightest material, and standard deviation of its logarithm.
+MEDIAN_BRIGHTNESS = 0.69
+BRIGHTNESS_DEVIATION = 0.16
+TINT_DEVIATION = 0.12  # standard deviation of the logarithm of a light's mean, by channel: of 33 captured maps
+BOUNCE_DEVIATION = 0.25  # the same of a factor that interreflection alone determines; on data/eames it is 7 to 50 % off
 # Least energy, as a share of a light's brightest channel: a light without blue does not decide how blue the others are.
 LEAST_ENERGY = 1e-3
 RULE = (
@@ -41,7 +51,8 @@ RULE = (
 )
 DETERMINED = (
     "; components in which interreflection or surroundings were seen have no free factor, and reflectances as these "
-    "determine them, but none above 1"
+    "determine them, but none above 1; interreflection alone is weighed with the tints of natural lights and the "
+    "brightness of bright materials"
 )
 GIVEN = "; in components with known materials or lights, scale and white balance come from these: {}"
 UP_TO_SCALE = "; where lights are known up to a factor, white balance comes from them: {}"
@@ -94,20 +105,33 @@ def fix_gauge(point: Point, blocks: Sequence[Block], known: KnownValues = KnownV
         linked_lights = [names.index(name) for name in illuminations]
         rows = list(members)
         factors = known.free_factors(members, illuminations)
-        is_free = has_free_factor(blocks, illuminations)
-        if not linked_lights or not factors or not (is_free or (diffuse[rows] + specular[rows]).max() > 1):
+        if not linked_lights or not factors:
             continue
-        # log s_c from the geometric means of E_ic; reflectances take 1/s_c and the scale of BRIGHTEST
+        # log s_c from the geometric means of E_ic; reflectances take 1/s_c
         sums = np.array([lights[i].energy.sum(0) for i in linked_lights])
         level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), TINY)))
-        tint = (level.mean(1, keepdims=True) - level).mean(0) if is_free and factors == 3 else np.zeros(3)
-        factor = 1 / np.exp(tint)  # multiplies reflectances
-        factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
+        grey = (level - level.mean(1, keepdims=True)).mean(0)
+        sum_of_parts = diffuse[rows] + specular[rows]
+        factor = np.ones(3)
+        if has_free_factor(blocks, illuminations):
+            factor = np.exp(grey) if factors == 3 else factor
+            factor = factor * BRIGHTEST / (factor * sum_of_parts).max()
+        elif factors == 3 and all(blocks[i].background is None for i in linked_lights):
+            factor = np.exp(_share_of_prior(TINT_DEVIATION / np.sqrt(len(linked_lights))) * grey)
+            brightness = (factor * sum_of_parts).mean(1).max()
+            factor = factor * (MEDIAN_BRIGHTNESS / brightness) ** _share_of_prior(BRIGHTNESS_DEVIATION)
+        if (factor * sum_of_parts).max() > 1:
+            factor = factor * BRIGHTEST / (factor * sum_of_parts).max()
         diffuse[rows] = diffuse[rows] * factor
         specular[rows] = specular[rows] * factor
         for i in linked_lights:
             lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
     return Point(Materials(diffuse, specular, point.materials.roughness), lights)
+
+
+def _share_of_prior(deviation: float) -> float:
+    """Return the weight of a prior of this standard deviation beside a factor that interreflection determines."""
+    return BOUNCE_DEVIATION**2 / (BOUNCE_DEVIATION**2 + deviation**2)
 
 
 def has_free_factor(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:

@@ -45,7 +45,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from factorlib.inference.blocks import Block
-from factorlib.inference.gauge import connected_components
+from factorlib.inference.gauge import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, connected_components
 from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import LEAST_REFLECTANCE, REFLECTANCES, ROUGHNESS, UNKNOWNS, Materials
 from factorlib.jsonfile import read_json
@@ -58,9 +58,6 @@ ROUGHNESS_DEVIATION = 1.0  # standard deviation of roughness about the start
 SCALE_DEVIATION = 0.5
 CLASS_ROUGHNESS_DEVIATION = 0.2
 WHITE_DEVIATION = 0.1
-# Median of b, and standard deviation of log b, in (2).
-MEDIAN_BRIGHTNESS = 0.69
-BRIGHTNESS_DEVIATION = 0.16
 # Projections of l on its mean and on the difference from it.
 MEAN = np.full((3, 3), 1 / 3)
 TINTS = np.eye(3) - 1 / 3

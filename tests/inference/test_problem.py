@@ -7,7 +7,15 @@ import pytest
 from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
-from factorlib.inference.gauge import BRIGHTEST, connected_components, fix_gauge
+from factorlib.inference.gauge import (
+    BOUNCE_DEVIATION,
+    BRIGHTEST,
+    BRIGHTNESS_DEVIATION,
+    MEDIAN_BRIGHTNESS,
+    TINT_DEVIATION,
+    connected_components,
+    fix_gauge,
+)
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.lights import Light, UnitLobes, fibonacci_cells
 from factorlib.inference.materials import Materials, Point
@@ -209,19 +217,32 @@ def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
-def test_what_interreflection_determines_the_gauge_leaves(illumination):
-    point = Point(MATERIALS, [illumination.light])
-    np.testing.assert_array_equal(fix_gauge(point, [illumination.block]).materials.diffuse, MATERIALS.diffuse)
-    assert (
-        fix_gauge(point, [illumination.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse
-    ).any()
+def test_surroundings_determine_the_gauge_and_interreflection_alone_is_weighed_with_priors(illumination):
+    """Logarithms of the factors are the most probable ones under both, each with its own deviation."""
+    block, light = illumination.block, illumination.light
+    point = Point(MATERIALS, [light])
+    seen = msgspec.structs.replace(block, background=True)
+    np.testing.assert_array_equal(fix_gauge(point, [seen]).materials.diffuse, MATERIALS.diffuse)
+    settled = fix_gauge(point, [block]).materials
+    factor = settled.diffuse[0] / MATERIALS.diffuse[0]
+    trials = np.linspace(-3, 3, 60001)
+
+    def likeliest(by_prior: float, deviation: float) -> float:
+        return trials[np.argmin((trials / BOUNCE_DEVIATION) ** 2 + ((trials - by_prior) / deviation) ** 2)]
+
+    level = np.log(light.energy.sum(0))
+    tint = np.array([likeliest(each, TINT_DEVIATION) for each in level - level.mean()])
+    np.testing.assert_allclose(np.log(factor) - np.log(factor).mean(), tint - tint.mean(), atol=2e-4)
+    brightness = (np.exp(tint) * (MATERIALS.diffuse + MATERIALS.specular)).mean(1).max()
+    scale = likeliest(np.log(MEDIAN_BRIGHTNESS / brightness), BRIGHTNESS_DEVIATION)
+    np.testing.assert_allclose(np.log(factor), tint + scale, atol=4e-4)
 
 
-def test_no_reflectance_is_above_one_where_interreflection_determines_the_scale(illumination):
+def test_no_reflectance_is_above_one_where_surroundings_determine_the_scale(illumination):
     """One factor for the whole component, so that tints stay."""
     light = illumination.light
     bright = Materials(3 * MATERIALS.diffuse * [1.0, 1.3, 0.8], 3 * MATERIALS.specular, MATERIALS.roughness)
-    settled = fix_gauge(Point(bright, [light]), [illumination.block])
+    settled = fix_gauge(Point(bright, [light]), [msgspec.structs.replace(illumination.block, background=True)])
     assert (settled.materials.diffuse + settled.materials.specular).max() == pytest.approx(BRIGHTEST)
     factor = settled.materials.vector()[0] / bright.vector()[0]
     np.testing.assert_allclose(settled.materials.diffuse, factor * bright.diffuse)
