@@ -39,7 +39,7 @@ from factorlib.meshes.subdivision import subdivide
 from factorlib.results.materials import Reflectance
 from factorlib.scenes.bodies import bumpy_ball, jug, mesh_from_parts, stack
 from factorlib.tracing.scene import bsdf, envmap, paint, render_scene, rigid, sensor, shape
-from factorlib.wholefile import write_bytes
+from factorlib.wholefile import write_bytes, write_text
 from studies.measured.tools import ROOT, evaluate_dataset, machine, markdown_table, run_verb
 
 PLACE = ROOT / "build/bench/walks"
@@ -215,8 +215,8 @@ def import_walk(name: str, photos: Path) -> tuple[Path, Float[np.ndarray, "p m"]
     illumination = {first.illumination: "truth/room.exr"}
     write_yaml(dataset / "truth/truth.yaml", {"materials": known, "illumination": illumination}, "of a made walk")
     if "truth" not in declared:
-        with (dataset / "dataset.yaml").open("a", encoding="utf-8") as file:
-            file.write("truth: truth/truth.yaml\n")
+        file = dataset / "dataset.yaml"
+        write_text(file, file.read_text(encoding="utf-8") + "truth: truth/truth.yaml\n")
     return dataset, overlaps
 
 
