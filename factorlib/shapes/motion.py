@@ -10,10 +10,8 @@ uses one thread. Seeds are fixed, so the same photos give the same cameras.
 
 import logging
 import shutil
-import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing
 from functools import partial
 from itertools import combinations, count
 from pathlib import Path
@@ -43,6 +41,8 @@ EXHAUSTIVE = 30  # greatest number of photos that are all matched with each othe
 FEW = 10  # least number of photos of each hull, of larger sets
 ENOUGH = 0.9  # share of a larger set's photos that one region's model must register for the other not to be mapped
 POLL = 0.2  # time between reports, s
+FEATURE_BYTES = MOST_FEATURES * (6 * 4 + 128)  # of a photo in the database, at most: shapes and descriptors
+PAIR_BYTES = 2 * 4096  # of a pair of photos: a page of matches, and one of verified ones
 SEED = 0
 DATABASE = "features.db"
 CURE = (
@@ -231,23 +231,39 @@ def _extract_features(
         pycolmap.extract_features, root / DATABASE, root / "images", files, pycolmap.CameraMode.AUTO, reader,
         extraction, pycolmap.Device.cpu,
     )  # fmt: skip
-    _fill_table(extract, root / DATABASE, "keypoints", lambda rows: report(0.2 * rows / len(files), "features"))
+    _fill_database(extract, root / DATABASE, FEATURE_BYTES * len(files), lambda share: report(0.2 * share, "features"))
     return known_focals
 
 
-def _fill_table(
-    work: Callable[[pycolmap.CancellationToken], None], database: Path, table: str, report: Callable[[int], None]
+def _fill_database(
+    work: Callable[[pycolmap.CancellationToken], None], database: Path, expected: float, report: Callable[[float], None]
 ) -> None:
-    """Run COLMAP's work on a database in a thread, and report the number of rows of the table that it fills."""
+    """Run COLMAP's work on a database in a thread, and report its progress by the growth of the database's files.
+
+    Nothing else may open the database meanwhile: another SQLite in this process would release COLMAP's locks, and the
+    database would be damaged ("How To Corrupt An SQLite Database File", section 2.2.1).
+
+    Args:
+        work: Function of a token by which it is cancelled.
+        database: File of the database.
+        expected: Bytes by which its files grow.
+        report: Called with the completed share, from 0 to 1.
+    """
+    before = _size(database)
     token = pycolmap.CancellationToken()
-    with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as rows, ThreadPoolExecutor(1) as thread:
+    with ThreadPoolExecutor(1) as thread:
         future = thread.submit(work, token)
         try:
             while not wait([future], POLL).done:
-                report(rows.execute(f"select count(*) from {table}").fetchone()[0])
+                report(min((_size(database) - before) / expected, 1.0))
         finally:
             token.cancel()
         future.result()
+
+
+def _size(database: Path) -> int:
+    """Return the number of bytes of a database and of its journals."""
+    return sum(file.stat().st_size for file in database.parent.glob(f"{database.name}*"))
 
 
 def _select_features(root: Path, masks: Mapping[str, Bool[np.ndarray, "h w"]]) -> dict[str, UInt8[np.ndarray, "_ 128"]]:
@@ -289,7 +305,7 @@ def _match_features(
     write_text(root / "pairs.txt", "".join(f"{one}.png {other}.png\n" for one, other in pairs))
     pairing = pycolmap.ImportedPairingOptions(match_list_path=str(root / "pairs.txt"))
     match = partial(pycolmap.match_image_pairs, root / DATABASE, matching, pairing, verification, pycolmap.Device.cpu)
-    _fill_table(match, root / DATABASE, "matches", lambda rows: report(0.1 + 0.4 * rows / len(pairs), "matches"))
+    _fill_database(match, root / DATABASE, PAIR_BYTES * len(pairs), lambda share: report(0.1 + 0.4 * share, "matches"))
 
 
 def _reconstruct(
