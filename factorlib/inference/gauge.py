@@ -16,9 +16,9 @@ Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`.  A brigh
        surface has, the component takes this scale, too, at its own tint.
 
 Bounces  Interreflection alone determines the factors badly: on a hull, light from hidden surfaces comes from wrong
-       places (a white box in the sun came out at .2, and red).  So logarithms of factors are means of those and of the
-       prior's, weighted by their variances: `BOUNCE_DEVIATION`², that of mean tints of natural lights, and that of the
-       brightness of the brightest material.
+       places (a white box in the sun came out at .13, .20, .20 in place of .6, in too red a light).  The logarithm of a
+       factor is therefore a mean of two, weighted by their precisions.  One is that of the solve.  The other is that of
+       the priors on the mean tint of natural lights and on the brightness of the brightest material.
 """
 
 from __future__ import annotations
@@ -40,8 +40,11 @@ BRIGHTEST = 0.9
 # Median of the mean reflectance of a set's brightest material, and standard deviation of its logarithm.
 MEDIAN_BRIGHTNESS = 0.69
 BRIGHTNESS_DEVIATION = 0.16
-TINT_DEVIATION = 0.12  # standard deviation of the logarithm of a light's mean, by channel: of 33 captured maps
-BOUNCE_DEVIATION = 0.25  # the same of a factor that interreflection alone determines; on data/eames it is 7 to 50 % off
+# Standard deviation of the logarithm of a light's mean radiance, by channel, relative to grey: .11, .08 and .14 in 33
+# captured maps (`studies.measured.captured_lights`).
+TINT_DEVIATION = 0.12
+# The same of a factor that interreflection alone determines: 7 to 50 % on data/eames and sets like it.
+BOUNCE_DEVIATION = 0.25
 # Least energy, as a share of a light's brightest channel: a light without blue does not decide how blue the others are.
 LEAST_ENERGY = 1e-3
 RULE = (

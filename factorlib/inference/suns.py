@@ -51,8 +51,8 @@ GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))
 # and 13, true suns hold 9 % of the light or more and lower the loss by 1.2 to 15 %.
 LEAST_SUN_GAIN = 0.01
 LEAST_SUN_SHARE = 0.07
-# Least sum of a sun's share of the light and of its warmth, in sunlight.  Of 33 captured maps and the six lights of
-# data/eames those with a sun have .9 and more, by their brightest 15°; the others have .66 at most.
+# Least sum of a sun's share of the light and of its warmth, in sunlight.  Of 33 captured maps, by their brightest 15°,
+# seven with a sun and a dawn have .95 and more, and the others .66 at most (`studies.measured.captured_lights`).
 SUNLIGHT = 0.8
 ONE_STEP = FitSchedule(light_steps=1, materials_fixed=True)
 AROUND_SUNS = FitSchedule(
