@@ -3,7 +3,6 @@
 from functools import cache
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -122,26 +121,6 @@ def office(tmp_path_factory) -> list[Path]:
     folder = tmp_path_factory.mktemp("sets")
     names = ("office",)
     return [made_chairs(folder / str(painted), names, 32, exact=True, painted=painted) for painted in (False, True)]
-
-
-@pytest.mark.long
-def test_the_same_seed_is_the_same_paint(office, tmp_path):
-    again = made_chairs(tmp_path / "again", ("office",), 32, exact=True, painted=True)
-    assert files_of(again) == files_of(office[1])
-
-
-@pytest.mark.long
-def test_paint_changes_pictures_and_nothing_else(office):
-    """A set without paint has the same mesh, masks, normals, poses and materials, and no albedo."""
-    plain, painted = map(files_of, office)
-    assert set(painted) ^ set(plain) == {"truth/office_albedo.exr"}
-    changed = {name for name in plain if plain[name] != painted[name]}
-    normal, painted_normal = (read_exr(each / "truth/office_normal.exr")["normal.x"] for each in office)
-    assert np.abs(normal - painted_normal).max() < 0.05  # the painted mesh has shorter edges
-    maps = {"truth/office_light.exr", "truth/office_normal.exr", "truth/truth.yaml"}
-    assert changed == {"photos/office.jpg", "dataset.yaml", *maps}
-    plain_truth, truth = (read_dataset(each).truth for each in office)
-    assert truth == msgspec.structs.replace(plain_truth, albedo={"office": "truth/office_albedo.exr"})
 
 
 @pytest.mark.long

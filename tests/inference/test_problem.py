@@ -292,19 +292,6 @@ def test_a_smooth_light_stays_when_cells_split_and_when_theirs_split_again(share
         assert off[rough].std() < 0.01 and off[~rough].std() < ripple, (off[rough].std(), off[~rough].std())
 
 
-@pytest.mark.parametrize("scattered", [False, True])
-def test_split_cells_leave_no_dark_or_bright_spots(scattered):
-    """Of a constant light, at the most unfavourable direction and on average, split three times around one direction or here and there."""
-    light, rng = on_even_cells(np.zeros((3, 400))), np.random.default_rng(0)
-    for _ in range(3):
-        near = np.argsort(-light.axis @ [0.6, 0.0, 0.8])[: 100 if scattered else 24]
-        light = light.split(np.isin(np.arange(len(light)), rng.permutation(near)[:24]))
-        light = light.with_log_radiance(np.zeros((3, len(light))))
-    there = np.array([0.6, 0.0, 0.8]) + 0.4 * DIRECTIONS
-    radiance = shown(light, there / np.linalg.norm(there, axis=1, keepdims=True))
-    assert radiance.std() < 0.1 and radiance.min() > 0.45 and radiance.max() < 1.3
-
-
 def test_the_brightest_split_but_none_that_is_too_small():
     light, how = on_even_cells(drawn(1, 200)), (SPLIT_CELLS, 2 * np.radians(LEAST_SPACING_DEG))
     which = light.brightest_cells(*how)

@@ -146,24 +146,15 @@ def test_a_light_that_is_no_longer_so_starts_anew_and_is_named(caplog):
     explained(blocks[1:], materials, result[1:])
 
 
-def test_a_photo_new_to_a_light_with_tone_curves_gets_the_mean_of_theirs():
-    blocks, lights = truth(0, photos=3)
+def test_tone_curves_are_taken_over_and_a_photo_new_to_their_light_gets_the_mean_of_theirs():
+    blocks, lights = truth(0, 1, photos=3)
     earlier = written(blocks, MATERIALS, lights)
     curves = {photo: Tone(exponent, blocks[0].unit) for photo, exponent in zip(blocks[0].photos[1:], (1.1, 1.2))}
     model = msgspec.structs.replace(earlier.table.model, tone=curves)
     earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
-    (light,) = point_from_earlier(JointProblem(blocks, OPERATOR), earlier, NAMES, CELLS).lights
+    light, straight = point_from_earlier(JointProblem(blocks, OPERATOR), earlier, NAMES, CELLS).lights
     np.testing.assert_allclose(np.exp(light.log_tone), [np.sqrt(1.1 * 1.2), 1.1, 1.2])
-
-
-def test_tone_curves_are_taken_over_where_photos_of_a_light_have_one():
-    blocks, lights = truth(0, 1)
-    earlier = written(blocks, MATERIALS, lights)
-    model = msgspec.structs.replace(earlier.table.model, tone={blocks[0].photos[0]: Tone(1.1, blocks[0].unit)})
-    earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
-    point = point_from_earlier(JointProblem(blocks, OPERATOR), earlier, NAMES, CELLS)
-    np.testing.assert_allclose(np.exp(point.lights[0].log_tone), [1.1])
-    assert len(point.lights[1].log_tone) == 0
+    assert len(straight.log_tone) == 0
 
 
 @pytest.mark.parametrize(("kept", "tried"), [(True, True), (False, True), (True, False)])

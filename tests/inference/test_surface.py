@@ -16,10 +16,7 @@ from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
 from factorlib.inference.surface_detail import (
-    TURN_STIFFNESSES,
-    DetailSearch,
     DetailTrial,
-    SurfaceEstimate,
     estimate_surface,
 )
 from factorlib.inference.surface_turns import (
@@ -39,12 +36,10 @@ from factorlib.inference.surface_turns import (
 from factorlib.meshes import subdivision
 from factorlib.meshes.mesh import Mesh, scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
-from factorlib.reflection import reflection_operator
 from factorlib.results.poses import ObjectPose, pose_fields
 from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, light_of, on_even_cells, photographed, spheres
-from tests.stages.made import Rising
 
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]  # the object's axes in the camera's frame
 COUNTS = Hyperparameters(2.0)
@@ -105,19 +100,6 @@ def test_slopes_are_those_of_the_forward_model(kind):
     assert error < 0.03, error
 
 
-def test_slopes_by_compiled_derivatives_are_finite_differences():
-    one = photos_in_a_wrong_light("hidden")
-    own = msgspec.structs.replace(one, operator=reflection_operator("network"))
-    exact = msgspec.structs.replace(one, operator=reflection_operator("network", dtype="float64"))
-    normal, step = one.block.normal, 1e-4
-    sides = np.cross(normal, [0.6, 0.0, 0.8])
-    turned = [msgspec.structs.replace(one.block, normal=normal + s * sides) for s in (step, -step)]
-    after, before = (msgspec.structs.replace(exact, block=block).residuals() for block in turned)
-    inside = np.sum(normal * one.block.view, 1) > 0.2
-    expected, given = (after - before) / (2 * step), np.einsum("ncx,nx->nc", own.by_normal(), sides)
-    assert np.linalg.norm((given - expected)[inside]) < 0.02 * np.linalg.norm(expected[inside])
-
-
 def dented(size: float) -> tuple[DetailTrial, list[LightTerms]]:
     """A ball whose mesh has dents, in three lights that are at their optimum, and the lights linearised on the mesh."""
     problem, body = spheres([on_even_cells(drawn(100 + k, 120)) for k in range(3)], size=13, seed=1), surfaces()
@@ -144,21 +126,6 @@ def test_the_change_by_a_small_detail_is_that_of_lights_fitted_anew():
     given = [part.change(detail) for part in parts]
     assert np.abs(expected).max() > 0.2
     np.testing.assert_allclose(given, expected, atol=0.08 * np.abs(expected).max())
-
-
-@pytest.mark.long
-def test_the_stiffness_by_linearised_lights_gains_most_of_what_the_likeliest_by_lights_fitted_anew_does():
-    trial, parts = dented(0.15)
-    plain = trial.score_photos([zero_detail(trial.surfaces.nodes)] * len(trial.photos))
-    search = DetailSearch(trial, parts, trial.surfaces.laplacian(), plain, lambda: None)
-    candidates = [Stiffness(a) for a in TURN_STIFFNESSES]
-    nodes = trial.shared_nodes
-    gains = {}
-    for stiffness in candidates:
-        details = trial.fit_folds(parts, search.laplacian, stiffness, nodes, lambda: None)
-        gains[stiffness.turn] = float((plain.values - trial.score_photos(details).values).sum())
-    chosen, _ = search.select_stiffness(candidates, nodes)
-    assert gains[chosen.turn] > 0.7 * max(gains.values()) > 10, (chosen, gains)
 
 
 @pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])
@@ -222,36 +189,9 @@ def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
     np.testing.assert_allclose(nowhere.turn_normals(normal, view, np.ones((body.nodes, 3))), normal)
 
 
-def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[SurfaceEstimate, Surfaces, JointProblem, JointProblem]:
-    """What is found of a ball whose mesh has dents of that size, in so many lights."""
-    true = [on_even_cells(drawn(100 * seed + k, 120)) for k in range(lights)]
-    problem, body = spheres(true, size=13, seed=seed), surfaces()
-    given = with_wrong_normals(problem, size)
-    at = [attached_to(block.normal, body) for block in problem.blocks]
-    progress = Rising()
-    return (
-        estimate_surface(given, body, at, start_from_photos(3), report=lambda share, what: progress(share, 1, what)),
-        body,
-        given,
-        problem,
-    )
-
-
 def errors(normals: np.ndarray, true: np.ndarray) -> float:
     """Median angle in degrees."""
     return float(np.median(np.degrees(np.arccos(np.clip(np.sum(normals * true, 1), -1, 1)))))
-
-
-@pytest.mark.long
-def test_dents_that_the_object_has_not_are_found_in_three_lights():
-    what, body, given, true = on_spheres(3, 0.15, 1)
-    assert what.evidence.accepted and sum(what.gains.values()) > 0 and not what.painted.accepted
-    turn = body.turns_from_displacements(what.displacements)
-    for block, exact in zip(given.blocks, true.blocks, strict=True):
-        at = attached_to(exact.normal, body)
-        before = errors(block.normal, exact.normal)
-        after = errors(at.turn_normals(block.normal, block.view, turn), exact.normal)
-        assert after < 0.6 * before, (before, after)
 
 
 @pytest.mark.long

@@ -181,6 +181,3 @@ def test_photos_that_do_not_overlap_are_refused():
         views_of(RESTING, apart, [looking_from(20, 40 + 90.0 * k) for k in range(4)]),
     )
     assert "each 10 to 20° from the next" in error.cure
-
-
-# ── Factors of a shape's axes: the derivative of image points by them ───────────────────────────────────────────────

@@ -7,7 +7,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.inference.blocks import Noise
@@ -126,26 +125,6 @@ def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_p
     assert all(count >= 24 for count in counts)
     assert min(min(m["stderr"]["diffuse"]) for m in table(out)["materials"].values()) > 0
     assert {p.stem for p in (out / "coverage").glob("*.exr")} == {"a", "b"}
-
-
-@pytest.mark.long
-def test_self_shadowing_is_chosen_by_evidence_and_said(tmp_path, linked, solved):
-    def hidden(part, kind):
-        random = np.random.default_rng(0).integers(0, 2, (len(part), 128))
-        visibility = np.full_like(random, 255) if kind == "nothing" else 255 * random
-        return msgspec.structs.replace(part, visibility=visibility)
-
-    nothing = run(tmp_path / "open", {k: hidden(v, "nothing") for k, v in linked.items()})
-    assert files_of(nothing) == files_of(solved)
-    wrong = {k: hidden(v, "random") for k, v in linked.items()}  # radiance was made without
-    outs = {c: run(tmp_path / c, wrong, self_shadowing=c) for c in ("auto", "on", "off")}
-    models = {c: table(out)["model"] for c, out in outs.items()}
-    assert [models[c]["self_shadowing"] for c in ("auto", "on", "off")] == [False, True, False]
-    evidence = models["auto"]["self_shadowing_chosen_by"]
-    assert evidence["log_bayes_factor"] < -5
-    rough = {c: [table(out)["materials"][name]["roughness"] for name in NAMES] for c, out in outs.items()}
-    assert rough["auto"] == pytest.approx(rough["off"], abs=0.03)  # the same model, begun elsewhere
-    assert models["on"]["self_shadowing_chosen_by"] == {}
 
 
 class Killed(Exception):
@@ -289,31 +268,6 @@ def test_a_held_out_photo_changes_no_answer_and_is_predicted(tmp_path, linked, s
     material = table(out)["materials"]["green"]
     reflectance = np.add(material["diffuse"], material["specular"]) / (MATERIALS.diffuse + MATERIALS.specular)[1]
     np.testing.assert_allclose(energy * reflectance / true, 1, atol=0.25)
-
-
-def test_the_background_of_a_held_out_photo_tells_its_light(tmp_path, linked):
-    """Where its surfaces, which face up, do not."""
-    photo = observations("d", [1], 7)
-    photo = photo.take(photo.normal[:, 1] < -0.3)
-    directions = lat_long_directions(32, 64)
-    below = directions[..., 1] < 0
-
-    def true(seed: int) -> np.ndarray:
-        return random_lobes(seed).radiance((directions @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(32, 64, 3)
-
-    light = {name: {"illumination": name, "world_from_camera": None, "held_out": name == "d"} for name in "abd"}
-    errors, tables = [], []
-    for seeds in ({"a": 1, "b": 2}, {"a": 1, "b": 2, "d": 7}):
-        folder = tmp_path / str(len(seeds)) / "urm/background"
-        folder.mkdir(parents=True)
-        for name, seed in seeds.items():
-            write_rgb_exr(folder / f"{name}.exr", true(seed) * below[..., None], LAT_LONG)
-        out = run(folder.parents[1], linked | {"d": photo}, light=light)
-        estimate = lat_long_of_lobes(read_lobes(out / "lobes.parquet")["d"], 32, 64)
-        errors.append(np.abs(np.log(estimate / true(7)))[below].mean())
-        tables.append(table(out))
-    assert tables[0] == tables[1] and tables[0]["model"]["background_chosen_by"]["b"]["kept"]
-    assert errors[1] < 0.8 * errors[0]
 
 
 def test_exposures_of_held_out_photos_follow_exif(tmp_path, linked):

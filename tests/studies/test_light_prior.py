@@ -6,16 +6,15 @@ import hashlib
 import msgspec
 import numpy as np
 import pytest
-from scipy.optimize import approx_fprime
 
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import write_rgb_exr
 from factorlib.inference.material_prior import Classes
 from factorlib.jsonfile import read_json
-from factorlib.light.prior import LightPrior, angles
+from factorlib.light.prior import LightPrior
 from studies.measured import light_prior, material_classes
-from studies.measured.light_prior import _cost, cell_means, fit_prior, log_cells, maps_in, mean_of, round_numbers
+from studies.measured.light_prior import fit_prior, maps_in, mean_of, round_numbers
 from tests.light.test_light import KNOWN
 
 
@@ -36,26 +35,6 @@ def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
     for name, rtol in (("variance", 0.25), ("decay_deg", 0.25), ("nugget", 0.3), ("level", 0.5), ("freedom", 0.4)):
         np.testing.assert_allclose(getattr(result, name), getattr(KNOWN, name), rtol=rtol)
     np.testing.assert_allclose(result.profile, KNOWN.profile, atol=0.15)
-
-
-def test_the_gradient_is_the_finite_difference():
-    cells, t = fibonacci_sphere(30), np.log([0.5, 0.4, 0.3, 0.2, 3.0])
-    design, values = np.ones((30, 1)), np.random.default_rng(0).standard_t(3, size=(6, 30))
-    slope = approx_fprime(t, lambda t: _cost(t, angles(cells), design, values)[0], 1e-6)
-    np.testing.assert_allclose(_cost(t, angles(cells), design, values)[1], slope, atol=1e-5)
-
-
-def test_cells_hold_the_energy_of_the_map_and_dark_ones_are_floored():
-    cells = fibonacci_sphere(50)
-    np.testing.assert_allclose(cell_means(np.full((32, 64, 3), 2.0), cells), 2.0)
-    lamp = np.zeros((64, 128, 3))
-    lamp[20, 40] = 1
-    assert np.count_nonzero(cell_means(lamp, cells).sum(axis=1)) == 1
-    with pytest.raises(ValueError, match="too few"):
-        cell_means(np.ones((2, 4, 3)), cells)
-    means = np.ones((1, 5, 3))
-    means[0, 0] = 0
-    assert np.isfinite(log_cells(means)).all() and log_cells(means)[0, 0, 0] == pytest.approx(np.log(0.8e-4))
 
 
 def test_the_table_says_what_it_was_made_from_and_how_good_it_is(tmp_path, monkeypatch):

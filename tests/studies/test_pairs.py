@@ -50,15 +50,3 @@ def test_what_is_right_is_not_told_apart_and_what_is_wrong_is_named(inputs, how,
     assert of["told_apart"] == bool(cause) and (of["cause"] == cause or not cause)
     right = [name for name in scene.FACTORS if name != cause] + ([] if cause else ["difference"])
     assert [of[name] for name in right] == pytest.approx([0] * len(right), abs=1e-3)
-
-
-def test_nothing_below_the_floor_is_told_apart():
-    photo, body = np.full((40, 40, 3), 0.3), np.zeros((40, 40), bool)
-    body[10:25, 10:25] = True
-    truth = photo.copy()
-    truth[body], truth[25:35, 10:30] = 0.2, 0.15
-    parts = dict.fromkeys(scene.FACTORS, truth)
-    for mine, its, progress in ((1.3, 1.0, True), (2.0, 1.0, False), (1.3, 1.5, False)):
-        of = scene.score(scene.Pair(1.3 * truth, truth), scene.Pair(mine * truth, its * truth), parts, photo, body)
-        assert of["told_apart"] == progress
-    assert scene.cielab(np.full((3, 3, 3), [1.0, 0, 0]))[1, 1] == pytest.approx([53.24, 80.09, 67.20], abs=0.05)

@@ -1,4 +1,4 @@
-"""The command line, one tiny study from worlds to the page, keys of its steps, and a run that was killed."""
+"""The command line, two tiny studies from worlds to the page, keys of its steps, and a run that was killed."""
 
 import json
 import os
@@ -12,9 +12,10 @@ from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
 from studies.catalogue import STUDIES
+from studies.catalogue import methods as comparison
 from studies.run import data_of, studies
 from studies.run.tables import write_study
-from studies.steps import score, solve, worlds
+from studies.steps import compare, score, solve, worlds
 from studies.study import QUICK
 
 TINY = msgspec.structs.replace(QUICK, largest=2, side=1, size=8, light_rows=8, light_spp=1)
@@ -83,3 +84,13 @@ def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     assert all(0 < row["cells"]["entries"]["spread"]["mean"] < 0.5 for row in table["rows"])
     text = (home / "paragraph.md").read_text()
     assert "no conclusion" in text and "| 1 × 1 |" in text
+
+
+def test_a_tiny_comparison_from_worlds_to_its_table(tmp_path, monkeypatch):
+    """By its steps."""
+    monkeypatch.setitem(comparison.SIZES, "quick", 12)
+    table = concluded(tmp_path, "comparison", data_of(tmp_path / "comparison", TINY), TINY, [solve, compare])[0]
+    cells = {row["name"]: {m: c["spread"]["mean"] for m, c in row["cells"].items()} for row in table["rows"]}
+    assert list(cells) == ["ours", "projective", "grey"] and table["quick"]
+    assert all({"novel_view", "novel_light", "processor"} <= of.keys() for of in cells.values())
+    assert cells["ours"]["novel_view"] < cells["grey"]["novel_view"] and "novel_material" not in cells["projective"]
