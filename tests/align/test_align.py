@@ -299,10 +299,3 @@ def test_more_labels_than_parts_and_none_tell_nothing(kinds):
     label = silhouette_of(LAMP, (1, 1), 5).label
     stripes = (np.arange(label.shape[1]) % max(kinds, 1) + 1) * min(kinds, 1)
     assert match_parts(LAMP, 2, [Silhouette(np.where(label > 0, stripes, 0).astype(np.int16))]) == [None]
-
-
-@pytest.mark.long
-def test_two_labels_among_four_parts_are_paired_although_there_are_fifty_pairings():
-    tower = boxes(*[((0.2 + 0.2 * k, 0.2, 0.3), (0.1 * k, 0.4 * k, 0)) for k in range(4)])
-    (paired,) = match_parts(tower, 4, [silhouette_of(tower, (1, 1, 2, 2), 1)])
-    assert [each[0] for each in paired.labels] == [1, 1, 2, 2]

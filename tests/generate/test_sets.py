@@ -115,28 +115,6 @@ def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
 # ── painted chairs ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.fixture(scope="module")
-def office(tmp_path_factory) -> list[Path]:
-    """A set without paint and the same with paint; the photo shows a red chair."""
-    folder = tmp_path_factory.mktemp("sets")
-    names = ("office",)
-    return [made_chairs(folder / str(painted), names, 32, exact=True, painted=painted) for painted in (False, True)]
-
-
-@pytest.mark.long
-def test_a_photo_shows_the_paint(office):
-    """The photo over that without paint has, in logarithms, the contrast of albedo over k_d, less what gloss adds."""
-    plain, painted = (read_photo(each / "photos/office.jpg").radiance for each in office)
-    labels = read_png(office[1] / "masks/office.png")[..., 0]
-    albedo = read_rgb_exr(office[1] / "truth/office_albedo.exr")
-    materials = read_dataset(office[1]).truth.materials
-    pixels = labels == 1 + list(materials).index("red")
-    assert (albedo[(labels > 0) & (labels < 255)] > 0).all()
-    expected = np.log(albedo[pixels] / materials["red"].diffuse)[:, 0]
-    actual = np.log(painted[pixels] / plain[pixels])[:, 0]
-    assert 0.6 < np.polyfit(expected, actual, 1)[0] < 1.1  # the noise of few samples is 0.1
-
-
 @cache
 def painted_chair(colour: str) -> Mesh:
     """The chair of seed 0 with a shell of this colour."""

@@ -13,7 +13,6 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 from PIL.TiffTags import LONG, RATIONAL, SHORT
 
-from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import box_mean, check_bright, decode_photo, open_photo, read_photo
@@ -247,16 +246,6 @@ def test_a_photo_that_is_black_or_negative_wherever_it_is_used_and_a_pipe_are_re
     os.mkfifo(tmp_path / "pipe.exr")
     for read in (read_exr, read_light_map):
         refusal("is a pipe", read, tmp_path / "pipe.exr")
-
-
-def test_focal_of_35mm_film_is_the_same_for_any_size_orientation_and_average(tmp_path):
-    for size, orientation in (((40, 60), 1), ((80, 120), 6)):
-        tags = {"Orientation": orientation, "Exif__FocalLengthIn35mmFilm": 50}
-        path = save(tmp_path / "a.jpg", np.zeros((*size, 3), dtype=np.uint8), **tags)
-        photo = read_photo(path)
-        half = np.hypot(photo.width, photo.height) / 2
-        assert np.arctan(half / photo.focal_px) == pytest.approx(np.arctan(FILM_DIAGONAL / 2 / 50))
-        assert decode_photo(open_photo(path), None, 4, path).focal_px == pytest.approx(photo.focal_px / 4)
 
 
 # ── Raw photos: what the sensor saw, not the preview beside it; linear, and clipped where the sensor was ────────────

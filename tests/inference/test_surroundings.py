@@ -20,16 +20,15 @@ from factorlib.inference.cast_shadows import CastShadows, cast_shadows
 from factorlib.inference.fit import Hyperparameters, initial_fit, light_likelihood
 from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
-from factorlib.inference.gauge import has_free_factor
 from factorlib.inference.held_out_photos import fit_held_out_lights
 from factorlib.inference.joint_solver import LIGHTS, solve
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import select_grounds
 from factorlib.inference.observed import blocks_of_observations, read_grounds
-from factorlib.inference.optimizer import descend_light, step_light
+from factorlib.inference.optimizer import step_light
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.paper_solver import PaperOptions, solve_paper
-from factorlib.inference.start import constant_light, start_from_photos
+from factorlib.inference.start import start_from_photos
 from factorlib.scenes.joint_problems import MATERIALS, observations_from_front, sphere_normals
 from factorlib.urm.observations import concatenate, write_observations
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, on_even_cells, photographed
@@ -151,12 +150,6 @@ def test_a_held_out_photo_gets_its_light_as_the_solve_does(lit, monkeypatch):
     assert np.abs(np.log(given / without)).max() > 0.1 and schedules[-1] is LIGHTS
 
 
-def test_the_factor_of_a_component_is_free_unless_a_background_fixes_it(lit):
-    names = [block.name for block in lit.blocks]
-    assert not has_free_factor(lit.blocks, names)
-    assert has_free_factor(lit.keep_backgrounds([]).blocks, names)
-
-
 def test_the_solver_of_the_paper_ignores_backgrounds_and_keeps_its_gauge(lit):
     quick = PaperOptions(lobes=4, samplings=0.5)
     with_them, without = (solve_paper(each, 3, quick) for each in (lit, lit.keep_backgrounds([])))
@@ -230,23 +223,6 @@ def test_the_likelihood_of_a_light_has_the_gradient_and_the_hessian_of_its_groun
     blocks = [j.T.astype(float) @ j for j, _ in one.ground.linearise(true[0].weight, FIT_LOSS, 2.0)]
     for c, block in enumerate(blocks):
         np.testing.assert_allclose(added[c * CELLS :][:CELLS, c * CELLS :][:, :CELLS], block, atol=1e-3 * block.max())
-
-
-def test_shadows_tell_of_a_light_what_a_flat_thing_does_not():
-    """Of a light behind the camera, a matt patch that faces aside says how bright it is, and its floor where."""
-    problem, true = photographed(7, 1, cells=CELLS)
-    block = problem.blocks[0].take(np.abs(problem.blocks[0].normal[:, 0]) > 0.9)
-    errors = []
-    for ground in (None, floor(true[0])):
-        shown = msgspec.structs.replace(block, ground=ground)
-        start = constant_light(shown, MATERIALS, CELLS)
-        own = true[0].log_radiance
-        start = msgspec.structs.replace(start, axis=true[0].axis, log_sharpness=true[0].log_sharpness)
-        one = light_likelihood(Illumination(shown, start, MATERIALS, OPERATOR), Hyperparameters(2.0), PRIOR, True)
-        found = descend_light(one, 6)[0].light.log_radiance
-        upper = true[0].axis @ UP > 0.2
-        errors.append(np.std((found - own)[:, upper], axis=1).mean())
-    assert errors[1] < 0.85 * errors[0], errors
 
 
 def test_shadows_count_only_where_the_objects_expect_them():

@@ -144,12 +144,6 @@ def test_every_form_is_the_same_labels(tmp_path, form):
     assert not result.left_out.any()
 
 
-def test_255_is_left_out(tmp_path):
-    result = labels(tmp_path, save(tmp_path / "a.png", np.vstack([WHITE[:1], LABEL[1:]])))
-    np.testing.assert_array_equal(result.label, LABEL)
-    assert result.left_out[0].all() and not result.left_out[1:].any()
-
-
 def test_forty_labels_are_labels_and_a_soft_matte_has_none(tmp_path):
     many = np.arange(H * W, dtype=np.uint16).reshape(H, W) // 15
     for values in (many, many.astype(np.uint8)):
