@@ -9,17 +9,12 @@ import pytest
 from factorlib import setup
 
 
-@pytest.fixture
-def lacking(monkeypatch):
-    """A machine that lacks a library of each kind, has apt-get, and whose user is not root."""
+def test_a_library_that_is_missing_is_one_message_with_the_command_and_root_installs_it(monkeypatch, capsys):
+    """On a machine that lacks a library of each kind and has apt-get, for another user than root and for root."""
     monkeypatch.setattr(setup, "NEEDED", {"libnone.so.9": "libnone9"})
     monkeypatch.setattr(setup, "FASTER", {"libfast.so.1": "libfast1"})
     monkeypatch.setattr(setup.os, "geteuid", lambda: 1000)
     monkeypatch.setattr(setup.shutil, "which", lambda name: f"/usr/bin/{name}" if name == "apt-get" else None)
-    return monkeypatch
-
-
-def test_a_library_that_is_missing_is_one_message_with_the_command_and_root_installs_it(lacking, capsys):
     with pytest.raises(SystemExit, match=r"do not load"):
         setup.check_system()
     output = capsys.readouterr().out
@@ -28,14 +23,14 @@ def test_a_library_that_is_missing_is_one_message_with_the_command_and_root_inst
         and "apt-get update && sudo apt-get install -y libnone9 libfast1" in output
     )
     there = {"libnone.so.9"}
-    lacking.setattr(setup, "loads", lambda name: name in there)
+    monkeypatch.setattr(setup, "loads", lambda name: name in there)
     setup.check_system()
     assert "the system libraries libfast.so.1 are missing" in capsys.readouterr().out
     there.clear()
     calls = []
-    lacking.setattr(setup.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(setup.os, "geteuid", lambda: 0)
     install = lambda command, **_: calls.append(command[-1]) or there.update(setup.NEEDED, setup.FASTER)  # noqa: E731
-    lacking.setattr(setup.subprocess, "run", install)
+    monkeypatch.setattr(setup.subprocess, "run", install)
     setup.check_system()
     assert len(calls) == 1 and capsys.readouterr().out == ""
     assert "update; apt-get" in calls[0] and calls[0].endswith(" libnone9 libfast1")

@@ -12,7 +12,7 @@ from factorlib.dataset import schema
 from factorlib.dataset.read_dataset import hold_out, read_dataset
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.validation import Validation
-from tests.faults.sample import put
+from tests.faults.sample import edited, put
 from tests.refusal import refusal
 
 TURN = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
@@ -74,13 +74,7 @@ def write(folder, spec=SPEC):
 
 def changed(key, value):
     """SPEC with another value at a key as errors write it, as in photos[0].camera."""
-    spec = copy.deepcopy(SPEC)
-    *way, last = [int(step) if step.isdigit() else step for step in re.findall(r"[^.\[\]]+", key)]
-    place = spec
-    for step in way:
-        place = place[step] if isinstance(place, list) or step in place else place.setdefault(step, {})
-    place[last] = value
-    return spec
+    return edited(SPEC, *(int(s) if s.isdigit() else s for s in re.findall(r"[^.\[\]]+", key)), value=value)
 
 
 def test_a_slice_is_json_converts_to_its_type_and_names_the_files_it_needs(folder):

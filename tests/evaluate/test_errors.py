@@ -175,19 +175,14 @@ def test_ssim_is_its_definition_where_the_window_is_whole(pictures):
 # ── re-synthesis ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.fixture
-def channels():
+def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds():
     """Two materials side by side, every normal facing the camera; and the photo's radiance."""
     one, none, radiance = np.ones((20, 30)), np.zeros((20, 30)), np.random.default_rng(5).uniform(0.2, 0.8, (20, 30, 3))
     label = np.where(np.arange(30) < 15, 1.0, 2.0) * one
     photo = {c: radiance[..., k] for k, c in enumerate("RGB")} | {"label": label, "valid": one.copy(), "left_out": none}
     photo |= {f"clipped.{c}": none.copy() for c in "RGB"}
     vectors = {f"{kind}.{a}": (-one if a == "z" else none) for kind in ("normal", "view") for a in "xyz"}
-    return photo, vectors | {"label": label.copy(), "confidence": one.copy()}, radiance
-
-
-def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds(channels):
-    photo, geometry, radiance = channels
+    geometry = vectors | {"label": label.copy(), "confidence": one.copy()}
     photo["clipped.R"][0, :4], photo["valid"][1, :3] = 1, 0
     geometry["label"][2, :2], geometry["confidence"][3, :7] = 0, 0
     shot = combine_photo(photo, geometry, radiance)

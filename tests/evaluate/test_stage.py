@@ -18,9 +18,9 @@ from factorlib.results.materials import Misfit, Reflectance, StandardErrors, att
 from factorlib.results.metrics import Metrics, Verdict
 from factorlib.results.surface_table import DetailEvidence, SurfaceTable
 from factorlib.runner.verbs import NO_TRUST
-from factorlib.stage import silent
 from stages import evaluate
 from tests.evaluate.made_artifacts import TRUE, Made, light_map, make_artifacts, paint
+from tests.stages.made import ran
 
 LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
 
@@ -36,9 +36,7 @@ def metrics_of(folder, **made) -> dict:
 
 
 def evaluated(inputs, out) -> dict:
-    out.mkdir()
-    evaluate.main(evaluate.Params(), inputs, out, silent)
-    return read_json(out / "metrics.json")
+    return read_json(ran(evaluate, inputs, out) / "metrics.json")
 
 
 @pytest.fixture(scope="module")

@@ -51,7 +51,10 @@ def least(precision: np.ndarray, start: np.ndarray):
     return minimize(energy, start, bounds=BOUNDS, tol=1e-12)
 
 
-@pytest.mark.parametrize("errors", [NO_ERROR, covariance([0.0] * 3 + [0.3] * 3 + [0.1])], ids=["right", "wrong"])
+MODEL_ERRORS = {"none": NO_ERROR, "few": covariance([0.0] * 3 + [0.3] * 3 + [0.1]), "many": covariance([0.1] * 3 + [1.0] * 3 + [0.3])}  # fmt: skip
+
+
+@pytest.mark.parametrize("errors", MODEL_ERRORS.values(), ids=MODEL_ERRORS)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_fit_under_the_prior_stays_unless_errors_of_the_model_give_the_prior_its_say(seed, errors):
     """A wider covariance than the fit weighs widens errors and moves nothing: the fit weighed its prior against its own."""

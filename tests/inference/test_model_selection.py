@@ -63,11 +63,6 @@ def solved(blocks, choices=QUICK, **others):
 # ── shadows and bounces, on bowls ────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.fixture(scope="module")
-def shaded():
-    return [blocks_of_observations(bowls(f"room{i}", rough_light(20 + i)), Noise(0.02, 0.02))[0] for i in range(2)]
-
-
 def lit_bowls(name, seed) -> Observations:
     """A bowl and a ball of each material, all bounces within a bowl as (1) has them: the fixed point of what it sends itself."""
     observed, normals, d = bowls(name, rough_light(seed), size=12, count=256), sphere_normals(12), fibonacci_sphere(256)
@@ -96,7 +91,8 @@ def lit():
 
 
 @pytest.mark.long
-def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(shaded):
+def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out():
+    shaded = [blocks_of_observations(bowls(f"room{i}", rough_light(20 + i)), Noise(0.02, 0.02))[0] for i in range(2)]
     error = {}
     for choice in ("off", "auto"):
         solution = solved(shaded, OF_SHAPES, self_shadowing=choice)
@@ -140,7 +136,7 @@ def test_bounces_of_a_hull_without_hollows_do_not_darken_the_materials():
     assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
 
 
-def test_shadows_that_are_none_are_given_up(shaded):
+def test_shadows_that_are_none_are_given_up():
     rng = np.random.default_rng(0)
     open_ = spheres([on_even_cells(drawn(k, 80)) for k in range(2)], size=10).blocks
 
@@ -180,13 +176,9 @@ def error_of(solution):
     return np.abs(result.diffuse * factor_between(result, MATERIALS) - MATERIALS.diffuse).max()
 
 
-@pytest.fixture(scope="module")
-def curved():
-    return [through(data, exponent) for data, exponent in zip(rooms(size=20), (1.3, 0.8, 1.0), strict=True)]
-
-
 @pytest.mark.long
-def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
+def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall():
+    curved = [through(data, exponent) for data, exponent in zip(rooms(size=20), (1.3, 0.8, 1.0), strict=True)]
     result, without = (solved(curved, MANY, tone=tone) for tone in ("auto", "off"))
     exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(result)]
     off = np.log(exponents) - np.log((1.3, 0.8, 1.0))
@@ -234,16 +226,11 @@ def test_without_interreflection_the_gauge_is_fixed_though_surfaces_light_each_o
     assert (result.point.materials.diffuse + result.point.materials.specular).max() == pytest.approx(BRIGHTEST)
 
 
-@pytest.fixture(scope="module")
-def begun_rooms():
-    problem = JointProblem(rooms(), OPERATOR)
-    return problem, FitRunner().fit("trial", problem, begun(problem, 60), FitSchedule(descents=(1,)))
-
-
-def test_models_that_predict_the_same_are_equal_evidence(begun_rooms, monkeypatch):
+def test_models_that_predict_the_same_are_equal_evidence(monkeypatch):
     """Neither gets more descent than the other: shadows of nothing, lights at any distance of one point, tone curves that are left out, and
     suns that are none."""
-    problem, fit = begun_rooms
+    problem = JointProblem(rooms(), OPERATOR)
+    fit = FitRunner().fit("trial", problem, begun(problem, 60), FitSchedule(descents=(1,)))
     open_ = {
         "visibility": lambda b: np.full((len(b), 96), 255, np.uint8),
         "directions": lambda b: fibonacci_sphere(96)[None],

@@ -46,11 +46,6 @@ def clipped(request):
     return photos_in_a_wrong_light("clipped", request.param == "toned")
 
 
-@pytest.fixture(scope="module")
-def rooms():
-    return three_rooms()
-
-
 def test_radiance_is_linear_in_light_and_atoms_are_what_a_lobe_adds_to_the_residual(clipped):
     straight = with_light(clipped, log_tone=np.zeros(0))
     twice = with_light(straight, weight=2 * straight.light.weight)
@@ -109,8 +104,8 @@ def test_components_of_unlinked_photos():
     assert connected_components(blocks, 4) == [((0, 1), ("a",)), ((2,), ("b",)), ((3,), ())]
 
 
-def test_the_gauge_changes_no_radiance_and_a_shifted_point_comes_to_the_same_one(rooms):
-    problem, point = rooms
+def test_the_gauge_changes_no_radiance_and_a_shifted_point_comes_to_the_same_one():
+    problem, point = three_rooms()
     factor = np.array([2.0, 0.5, 1.3])
     materials = Materials(point.materials.diffuse * factor, point.materials.specular * factor, MATERIALS.roughness)
     lights = [msgspec.structs.replace(light, weight=light.weight / factor) for light in point.lights]

@@ -29,6 +29,7 @@ from factorlib.results.solution import EarlierSolution
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block
 from factorlib.stage import serial_map
 from tests.inference.made_lights import FEW, OPERATOR, drawn, natural, on_even_cells, spheres
+from tests.stages.made import Killed
 
 NAMES, CELLS = ["red", "green", "blue"], 40
 
@@ -203,10 +204,6 @@ def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
 CHOICES = SolveOptions(cells=24, splittings=1, observations=100)
 PARTS = ("effects", "tone", "distances", "materials", "prior", "lights", "suns")
 ALL = tuple(PHASES)
-
-
-class Killed(Exception):
-    pass
 
 
 @pytest.fixture(scope="module", autouse=True)

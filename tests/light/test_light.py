@@ -102,20 +102,15 @@ def smooth_light(z):
     return 1 + 0.9 * z[..., 0] * z[..., 1] + 2 * np.exp(4 * (z @ np.array([0.6, 0, -0.8]) - 1))
 
 
-@pytest.fixture(scope="module")
-def places():
-    rng = np.random.default_rng(0)
-    place, normal, view = rng.normal(size=(3, 40, 3))
-    place *= (rng.uniform(0, 2, 40) / np.linalg.norm(place, axis=1))[:, None]
-    return place, *(v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, view))
-
-
 def irradiance(cosine, larger):
     return np.maximum(cosine, 0) * larger @ smooth_light(SPHERE) * SOLID_ANGLE
 
 
-def test_irradiance_beside_the_middle_is_that_of_rays_to_the_sphere_of_light(places):
-    place, normal, view = places
+def test_irradiance_beside_the_middle_is_that_of_rays_to_the_sphere_of_light():
+    rng = np.random.default_rng(0)
+    place, *others = rng.normal(size=(3, 40, 3))
+    place *= (rng.uniform(0, 2, 40) / np.linalg.norm(place, axis=1))[:, None]
+    normal, view = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in others)
     nz, _, larger = finite_distance_cosines(place, normal, view, SPHERE, CURVATURE)
     X = CURVATURE * place
     along = X @ SPHERE.T  # of rays in directions AXES from X, t is where they meet the unit sphere

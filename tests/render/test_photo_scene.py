@@ -9,7 +9,7 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.geometry.ground import Plane, resting_plane, stable_poses
-from factorlib.light.latlong import lat_long_of_lobes, sample_map
+from factorlib.light.latlong import sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import LEVEL_DEG, floor_rim, ground_below, level_ground, on_floor
@@ -26,7 +26,6 @@ from factorlib.render.photo_scene import (
     ALL_BOUNCES,
     CAMERA_POSE,
     MARGIN,
-    LightMap,
     Orbit,
     PhotoScene,
     PlacedMesh,
@@ -107,13 +106,6 @@ def test_turning_camera_objects_and_light_together_changes_nothing(pair):
         )
         < 0.02
     )
-
-
-def test_turned_lobes_and_their_turned_map_are_the_same_light(pair):
-    """The map's axes are the world's, the lobes' the camera's."""
-    as_map = msgspec.structs.replace(pair, light=rotate_light(LightMap(lat_long_of_lobes(pair.light, 64, 128)), 70))
-    as_lobes = msgspec.structs.replace(pair, light=rotate_light(pair.light, 70))
-    assert differ(traced_photo(as_lobes, 256), traced_photo(as_map, 256)) < 0.02
 
 
 def test_a_box_stands_on_its_largest_side_that_looks_down():

@@ -27,8 +27,7 @@ from tests.export.made_export import instead
 from tests.inference.made import observations_from_front
 from tests.integral import reflected
 from tests.runner.toy import files_of
-
-FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
+from tests.stages.made import ran
 
 
 @pytest.fixture
@@ -37,14 +36,10 @@ def inputs():
 
 
 def run(inputs, photo, out):
-    shaded = out.with_name(f"{out.name}, shading")
-    for folder in (out, shaded):
-        folder.mkdir()
     of_photo = made_export.of_photo(inputs, photo)
-    shading.main(shading.Params(operator="closed_form"), of_photo, shaded, silent)
+    shaded = ran(shading, of_photo, out.with_name(f"{out.name}, shading"), silent, operator="closed_form")
     after = msgspec.structs.replace(of_photo, folders={**of_photo.folders, "shading": shaded})
-    render.main(FAST, after, out, silent)
-    return out
+    return ran(render, after, out, silent, operator="closed_form", ball_size=33, map_size=32)
 
 
 def test_pictures_are_all_there_and_the_same_bytes_again(inputs, tmp_path):

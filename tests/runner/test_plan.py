@@ -4,9 +4,9 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from factorlib.errors import InputError
 from factorlib.runner.plan import Listing, Spec, Step, difference, hash_of, plan
 from factorlib.runner.project import Pipeline, Stage, read_pipeline
+from tests.refusal import refusal
 
 PIPELINE = Pipeline(
     1,
@@ -153,6 +153,5 @@ def test_a_stage_whose_slice_says_nothing_is_not_there_and_none_takes_its_result
     ],
 )
 def test_what_is_refused(tmp_path, old, new, words):
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, GOOD.replace(old, new))
-    assert all(word in str(caught.value) for word in words), str(caught.value)
+    caught = refusal(".", read, tmp_path, GOOD.replace(old, new))
+    assert all(word in str(caught) for word in words), str(caught)

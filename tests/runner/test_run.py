@@ -12,17 +12,16 @@ from functools import partial
 
 import pytest
 
-from factorlib.errors import InputError
 from factorlib.runner import display, verbs
-from factorlib.runner.plan import PlannedStep, Step
+from factorlib.runner.plan import PlannedStep, Step, hash_of
 from factorlib.runner.project import Pipeline, Stage, with_settings
-from factorlib.runner.results_folder import clean, collect
+from factorlib.runner.results_folder import clean, collect, make_view, verify
 from factorlib.runner.run_folder import begin_run, end_run
-from factorlib.runner.store import Store, is_locked, lock
+from factorlib.runner.store import MADE_FROM, Store, hash_of_file, is_locked, lock
 from tests.faults.test_kills import start, wait_until
 from tests.refusal import refusal
 from tests.runner import toy
-from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
+from tests.runner.toy import done, edit, files_of, make, make_project, new_runs, reasons, state, write
 
 COST = r" +\d+\.\d s +\d+\.\d s processor +\d+ MB peak   {} on 1 core   \d{{4}}-\d\d-\d\d \d\d:\d\d UTC$"
 WRITES = "json.dumps(params.scale)"  # what the table is, in its source
@@ -115,9 +114,8 @@ def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(proje
         ("table.scale", "stage.parameter=value"),
         ("table.preset=fast", "no preset 'fast'"),
     ):
-        with pytest.raises(InputError) as caught:
-            make(project, setting)
-        assert words in str(caught.value) and "pipeline.yaml" not in str(caught.value)
+        caught = refusal(".", make, project, setting)
+        assert words in str(caught) and "pipeline.yaml" not in str(caught)
     for setting, words in (("table.scael=3", "did you mean 'scale'"), ("count.x=1", "unknown key 'x'")):
         for verb in (verbs.make, verbs.show_plan):
             assert verb(project, verbs.Request("set", settings=[setting])) == 1
@@ -145,12 +143,10 @@ def test_a_value_out_of_bounds_is_refused_before_anything_runs_and_says_who_gave
 
 def test_a_dataset_that_is_not_there_and_two_folders_of_one_name_are_refused(project, tmp_path):
     write(project.root / "data" / "set" / "dataset.yaml", "")
-    with pytest.raises(InputError, match="no dataset 'sett'") as caught:
-        verbs.make(project, verbs.Request("sett"))
-    assert "did you mean 'set'" in caught.value.cure
+    caught = refusal("no dataset 'sett'", verbs.make, project, verbs.Request("sett"))
+    assert "did you mean 'set'" in caught.cure
     shutil.copytree(project.root / "data" / "set", tmp_path / "else" / "set")
-    with pytest.raises(InputError, match="two datasets are called 'set'"):
-        verbs.make(project, verbs.Request(str(tmp_path / "else" / "set")))
+    refusal("two datasets are called 'set'", verbs.make, project, verbs.Request(str(tmp_path / "else" / "set")))
     assert verbs.make(project, verbs.Request(str(project.root / "data" / "set"))) == 0  # the same one by its path
     shutil.move(project.root / "data" / "set", tmp_path / "set")
     assert verbs.make(project, verbs.Request(str(tmp_path / "set"))) == 0
@@ -300,8 +296,7 @@ def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsy
     assert wait_until(lambda: sleeping(project))
     verbs.show_status(project, verbs.Request("set"))
     assert re.search(r"^upper +[12] running", capsys.readouterr().out)
-    with pytest.raises(InputError, match="a run is using this store"):
-        collect(project)
+    refusal("a run is using this store", collect, project)
     second = start(project)
     waits = any("another run is making it" in line for line in second.stdout)
     go.touch()
@@ -333,30 +328,25 @@ def test_what_a_killed_step_left_to_go_on_from_outlives_it_and_goes_with_success
 # ── a folder that a parameter names ──────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.fixture
-def giving(project, tmp_path):
-    """The toy whose table reads start/seed.txt where it is given one; everything current without."""
+def test_a_given_folder_is_read_and_counts_by_content_not_by_place(project, tmp_path):
+    """Of the toy whose table reads start/seed.txt where it is given one; everything is current without."""
     seed = '(inputs["start"] / "seed.txt").read_text() if "start" in inputs.folders else params.scale'
     edit(project, "pipeline.yaml", "table: {}", "table: {given: {start: [seed.txt]}}")
     edit(project, "stages/table.py", WRITES, f"str({seed})")
     write(tmp_path / "one" / "seed.txt", "5")
     assert make(project) == 0
-    return project
-
-
-def test_a_given_folder_is_read_and_counts_by_content_not_by_place(giving, tmp_path):
     one, other = (f"table.start={tmp_path / folder}" for folder in ("one", "other"))
-    assert new_runs(giving, one) == ["table", "total"] and total(giving) == "total: 45"
+    assert new_runs(project, one) == ["table", "total"] and total(project) == "total: 45"
     shutil.copytree(tmp_path / "one", tmp_path / "other")
     write(tmp_path / "other" / "more.txt", "not read")
-    assert new_runs(giving, other) == []
+    assert new_runs(project, other) == []
     write(tmp_path / "other" / "seed.txt", "6")
-    assert reasons(giving, "table", settings=(other,)) == ["given file start/seed.txt: changed"]
-    assert new_runs(giving, other) == ["table", "total"]
-    assert new_runs(giving) == [] and total(giving) == "total: 18", "it is off unless named"
-    assert str(tmp_path) not in "".join(path.read_text() for path in (giving.build / "store" / "keys").iterdir())
-    edit(giving, "stages/table.py", "    (out", "    (inputs['start'] / 'seed.txt').write_text('9')\n    (out")
-    assert make(giving, one) == 1, "what changes while it is read is no result"
+    assert reasons(project, "table", settings=(other,)) == ["given file start/seed.txt: changed"]
+    assert new_runs(project, other) == ["table", "total"]
+    assert new_runs(project) == [] and total(project) == "total: 18", "it is off unless named"
+    assert str(tmp_path) not in "".join(path.read_text() for path in (project.build / "store" / "keys").iterdir())
+    edit(project, "stages/table.py", "    (out", "    (inputs['start'] / 'seed.txt').write_text('9')\n    (out")
+    assert make(project, one) == 1, "what changes while it is read is no result"
 
 
 def test_the_folder_of_a_run_goes_even_if_a_step_writes_to_it_while_it_is_deleted(tmp_path, monkeypatch):
@@ -382,3 +372,153 @@ def test_two_that_ask_whether_a_run_lives_do_not_take_each_other_for_it(tmp_path
     with open(path, "rb") as asking:
         fcntl.flock(asking, fcntl.LOCK_SH)
         assert not is_locked(path)
+
+
+# ── Results of others: a store that checkouts share, and results that ship with the source ──────────
+
+
+COUNTED = "    (Path(__file__).parents[1] / 'computed').open('a').write('x')\n    (out"
+
+
+@pytest.fixture
+def shared(tmp_path, monkeypatch):
+    """An empty shared store."""
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    monkeypatch.setenv("FACTORLIB_STORE", str(folder))
+    return folder
+
+
+@pytest.fixture
+def one(tmp_path, shared):
+    """A checkout that has made everything, and so has the shared store."""
+    project = checkout(tmp_path / "one")
+    assert make(project) == 0 and computed(project) == 6 and not (project.build / "store").exists()
+    return project
+
+
+def checkout(folder, **texts):
+    """A toy that counts how often it computes, in a file that is no part of it."""
+    project = make_project(folder, **texts)
+    for name in ("upper", "count", "table", "total"):
+        text = (folder / "stages" / f"{name}.py").read_text().replace("    (out", COUNTED, 1)
+        write(folder / "stages" / f"{name}.py", "from pathlib import Path\n" + text)
+    return project
+
+
+def computed(project):
+    """How many steps were computed here, ever."""
+    file = project.root / "computed"
+    return len(file.read_text()) if file.exists() else 0
+
+
+def trees(store):
+    """What steps made, without the views of it that each checkout makes itself."""
+    entries = [json.loads(path.read_text()) for path in (store / "keys").iterdir()]
+    return {e["output"]: files_of(store / "trees" / e["output"]) for e in entries if "view" not in e["record"]}
+
+
+def test_what_one_checkout_makes_the_other_has(tmp_path, one, capsys):
+    other = checkout(tmp_path / "other")
+    verbs.show_plan(other, verbs.Request("set"))
+    assert "all 6 steps are current" in capsys.readouterr().out
+    assert make(other) == 0 and computed(other) == 0
+    assert files_of(other.build / "set" / "total") == files_of(one.build / "set" / "total")
+    assert set(state(other).values()) == {"current"} and verify(other, None) == 0
+    verbs.show_logs(other, verbs.Request("set"))
+    assert "MB peak" in capsys.readouterr().out, "what it cost is known here too"
+
+
+def test_neither_gc_nor_clean_deletes_what_others_need(tmp_path, one, shared):
+    other, before = checkout(tmp_path / "other"), trees(shared)
+    refusal("other checkouts share this store", collect, other)
+    assert make(other) == 0 and clean(other, None) == 0
+    assert trees(shared) == before and not (other.build / "set").exists()
+    assert new_runs(one) == []
+
+
+def test_a_forged_result_writes_nothing_outside(tmp_path, one, shared):
+    names = ["../../../../escaped", "/tmp/escaped", "a/../../../../../escaped"]
+    other, files = checkout(tmp_path / "other"), dict.fromkeys(names, "0" * 32)
+    for number, path in enumerate(sorted((shared / "keys").iterdir())):
+        entry, forged = json.loads(path.read_text()), dict([list(files.items())[number % 3]])
+        path.chmod(0o644)
+        path.write_text(json.dumps({**entry, "files": forged, "output": hash_of(forged)}))
+    assert make(other) == 0 and computed(other) == 6
+    assert not list(tmp_path.rglob("*escaped*")) and not os.path.exists("/tmp/escaped")
+
+
+def test_a_record_of_another_key_is_not_taken(tmp_path, one, shared):
+    assert make(one, "table.scale=3") == 0
+    other = checkout(tmp_path / "other")
+    key = next(p.key for p in toy.planned(other) if p.step.stage == "table")
+    records = {path: json.loads(path.read_text())["record"] for path in (shared / "keys").iterdir()}
+    forged = next(path for path, record in records.items() if record.get("param:scale") == 3)
+    shutil.copyfile(forged, shared / "keys" / f"{key}.json")
+    assert make(other) == 0 and (other.build / "set" / "table" / "table.json").read_text() == "2"
+
+
+def test_one_that_is_not_there_is_said_before_anything_runs(tmp_path, monkeypatch):
+    monkeypatch.setenv("FACTORLIB_STORE", str(tmp_path / "shared"))
+    project = checkout(tmp_path / "one")
+    for verb in (verbs.make, verbs.show_plan):
+        caught = refusal("no such folder", verb, project, verbs.Request("set"))
+        assert "FACTORLIB_STORE" in str(caught)
+        write(tmp_path / "shared", "")
+    assert computed(project) == 0
+
+
+# ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def shipping(tmp_path):
+    """The toy, whose stage `table` has shipped a result that no stage would make: 2 by itself, 7 as shipped."""
+    project = make_project(tmp_path / "root")
+    shipped = "table: {shipped: {folder: stages/tables, made_by: [stages.table]}}"
+    write(project.pipeline_file, toy.PIPELINE.replace("table: {}", shipped))
+    assert make(project, targets=["table"]) == 0
+    folder = project.root / "stages" / "tables"
+    write(folder / "table.json", "7")
+    stored = json.loads(next((project.build / "store" / "keys").iterdir()).read_text())
+    stored["files"]["table.json"] = hash_of_file(folder / "table.json")
+    (folder / MADE_FROM).write_text(json.dumps(stored))
+    return project
+
+
+@pytest.mark.parametrize(
+    "settings, force, plus, expected",
+    [([], False, 0, 7), ([], True, 0, 2), (["table.scale=3"], False, 0, 3), ([], False, 10, 12)],
+    ids=["as shipped", "forced", "another parameter", "another source"],
+)
+def test_a_shipped_result_is_taken_where_sources_and_parameters_are_its_own(shipping, settings, force, plus, expected):
+    if plus:
+        text = toy.TABLE.replace("dumps(params.scale)", f"dumps(params.scale + {plus})")
+        write(shipping.root / "stages" / "table.py", text)
+    assert make(shipping, *settings, targets=["table"], force=force) == 0
+    assert json.loads((shipping.build / "set" / "table" / "table.json").read_text()) == expected
+
+
+def test_a_shipped_file_that_was_changed_is_an_error(shipping, capsys):
+    folder = shipping.root / "stages" / "tables"
+    (folder / "table.json").write_text("8")
+    assert make(shipping, targets=["table"]) == 1
+    assert "are not the files that were shipped" in capsys.readouterr().err
+    stored = json.loads((folder / MADE_FROM).read_text())
+    (folder / MADE_FROM).write_text(
+        json.dumps(stored | {"files": {"../table.py": hash_of_file(folder / "table.json")}})
+    )
+    assert make(shipping, targets=["table"]) == 1, "a name that leads out of the folder"
+
+
+def test_two_photos_with_one_file_name_are_refused_and_a_view_without_its_gathered_file_is_made_again(tmp_path):
+    store = Store(tmp_path)
+    for photo in ("a", "b"):
+        write(store.trees / photo / f"{photo}.json", "{}")
+        write(store.trees / f"{photo}-same" / "same.json", photo)
+    store.tmp.mkdir(exist_ok=True)
+    view = make_view(store, {"a": "a", "b": "b"}, "all.json")
+    (view / "all.json").unlink()
+    assert make_view(store, {"a": "a", "b": "b"}, "all.json") == view and (view / "all.json").is_file()
+    refusal("'same.json'", make_view, store, {"a": "a-same", "b": "b-same"}, None)
+    assert [(store.trees / f"{p}-same" / "same.json").read_text() for p in "ab"] == ["a", "b"]

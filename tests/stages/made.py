@@ -9,6 +9,10 @@ from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 
 
+class Killed(Exception):
+    """The end of a stage in its midst."""
+
+
 class Rising:
     """A stage's progress, which must never fall; `moves`: how often it rose."""
 
@@ -18,6 +22,13 @@ class Rising:
     def __call__(self, done: float, total: float, text: str = "") -> None:
         assert self.share - 1e-9 <= done / total <= 1, text
         self.moves, self.share = self.moves + (done / total > self.share), done / total
+
+
+def ran(stage, inputs, out: Path, progress=None, **params) -> Path:
+    """Run a stage with these parameters into a folder that is made where it is not there, and return it."""
+    out.mkdir(parents=True, exist_ok=True)
+    stage.main(stage.Params(**params), inputs, out, progress or Rising())
+    return out
 
 
 def write_masks(folder: Path, photo: str, label: np.ndarray, focal, source, channels=None) -> None:

@@ -21,9 +21,9 @@ from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.scenes.stage_runs import run_stages
 from factorlib.stage import Inputs
 from stages import align, masks
-from tests.align.scenes import blob, chair, normal_error_deg, photo_of
+from tests.align.scenes import blob, chair, photo_of
 from tests.refusal import refusal
-from tests.stages.made import Rising, chair_facts, entry_of, write_masks
+from tests.stages.made import Rising, chair_facts, entry_of, ran, write_masks
 
 QUICK = SearchOptions(views=160, rolls=16, keep=(20, 8, 4, 2))
 KNOWN = {"pose_given": True, "focal": 300.0, "source": "dataset"}
@@ -42,9 +42,7 @@ def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, s
 
 
 def run(tmp_path, inputs, name="out", **params):
-    out = tmp_path / name
-    out.mkdir()
-    align.main(align.Params(search=QUICK, **params), inputs, out, progress := Rising())
+    out = ran(align, inputs, tmp_path / name, progress := Rising(), search=QUICK, **params)
     assert progress.moves >= 1
     return out, json.loads((out / "a.json").read_text())
 
@@ -208,8 +206,8 @@ CASTER = Caster(chair())
 LENS = {"fl_x": CAMERA.focal, "cx": CAMERA.centre[0], "cy": CAMERA.centre[1], "w": 200, "h": 150}
 
 
-def scene(folder, *, scale=1, mesh=None, posed=True):
-    """A dataset of a photo of a chair, `scale` times as large as transforms.json says, which has poses or cameras alone."""
+def scene(folder, *, scale=1, mesh=None):
+    """A dataset of a photo of a chair, `scale` times as large as transforms.json says, which has poses."""
     for name in ("photos", "masks"):
         (folder / name).mkdir(parents=True)
     camera = Camera(200 * scale, 150 * scale, 300.0 * scale, (104.0 * scale, 71.0 * scale))
@@ -223,16 +221,15 @@ def scene(folder, *, scale=1, mesh=None, posed=True):
     )
     photo = {"name": "hall", "image": "photos/hall.png", "masks": "masks/hall.png"}
     photo["objects"] = [{"name": "chair", "mesh": "chair"}]
-    cameras = {"transforms": "t.json"} | ({"world_from_object": {"chair": {}}} if posed else {})
+    cameras = {"transforms": "t.json", "world_from_object": {"chair": {}}}
     meshes = {"chair": {"file": "chair.ply", "material": "white"}}
     spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [photo], "cameras": cameras}
     write_json(folder / "dataset.yaml", spec)
     return folder
 
 
-def aligned(folder, name="usual", search=None, **averaged):
-    params = {"masks": averaged, "align": {"search": search} if search else {}}
-    run_stages(read_dataset(folder), folder.parent / name, (masks, align), params)
+def aligned(folder, name="usual", **averaged):
+    run_stages(read_dataset(folder), folder.parent / name, (masks, align), {"masks": averaged})
     return read_json(folder.parent / name / "align" / "hall.json")
 
 
@@ -250,16 +247,6 @@ def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
     entry = aligned(scene(tmp_path / "large" / "set", scale=2))
     assert entry["camera"]["focal_px"] == 600.0 and entry["camera"]["principal_point"] == [208.0, 142.0]
     assert entry["objects"]["chair"]["silhouette_iou"] > 0.995
-
-
-def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
-    quick = {"views": 160, "rolls": 16, "keep": [20, 8, 4, 2]}
-    entry = aligned(scene(tmp_path / "set", posed=False), search=quick)
-    camera, obj = entry["camera"], entry["objects"]["chair"]
-    assert (camera["focal_source"], obj["source"], camera["focal_px"]) == ("transforms", "found", 300.0)
-    assert camera["principal_point"] == list(CAMERA.centre)
-    pose = Pose(np.array(obj["rotation"]), np.array(obj["translation"]))
-    assert normal_error_deg(CASTER, CAMERA, POSE, CAMERA, pose) < 1
 
 
 def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):

@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.inference.blocks import Noise
@@ -19,13 +20,13 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobe_table import read_lobes
 from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_normals
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
 from tests.inference.made import observations_from_front
 from tests.refusal import refusal
 from tests.runner.toy import files_of
-from tests.stages.made import Rising
+from tests.stages.made import Killed, ran
 
 NAMES = ("red", "green", "blue")
 
@@ -41,21 +42,17 @@ def observations(photo: str, materials, seed: int, size: int = 16, unit: float =
     return msgspec.structs.replace(empty, radiance=unit * radiance)
 
 
-def run(folder, photos, progress=silent, unfinished=None, start=None, light=None, known=None, files=None, **params):
-    urm, out = folder / "urm", folder / "out"
-    urm.mkdir(parents=True, exist_ok=True), out.mkdir(exist_ok=True)
+def run(folder, photos, progress=None, unfinished=None, start=None, light=None, known=None, files=None, **params):
+    (urm := folder / "urm").mkdir(parents=True, exist_ok=True)
     for name, part in photos.items():
         write_observations(urm / f"{name}.parquet", part)
     light = light or {name: {"illumination": name, "world_from_camera": None} for name in photos}
     folders = {"urm": urm, "train": SHIPPED} | ({"start": start} if start else {})
     facts = {"dataset.materials": list(NAMES), "dataset.light": light, "dataset.known": known or {}}
     inputs = Inputs(folders, facts, files or {}, unfinished=unfinished)
-    quick = {"merge_degrees": 0.0}
-    if params.get("solver") != "paper":
-        quick |= {"cells": 24, "splittings": 0, "observations": 150, "tone": "off"}
-    solve.main(solve.Params(**{**quick, **params}), inputs, out, reports := progress or Rising())
-    assert progress or "solver" in params or reports.share > 0.9
-    return out
+    joint = {"cells": 24, "splittings": 0, "observations": 150, "tone": "off"}
+    quick = {"merge_degrees": 0.0} | (joint if params.get("solver") != "paper" else {})
+    return ran(solve, inputs, folder / "out", progress, **quick | params)
 
 
 def random_lobes(seed: int) -> Lobes:
@@ -125,10 +122,6 @@ def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_p
     assert all(count >= 24 for count in counts)
     assert min(min(m["stderr"]["diffuse"]) for m in table(out)["materials"].values()) > 0
     assert {p.stem for p in (out / "coverage").glob("*.exr")} == {"a", "b"}
-
-
-class Killed(Exception):
-    pass
 
 
 def test_another_order_and_a_solve_that_was_killed_give_the_same_bytes(tmp_path, linked, solved):
@@ -268,6 +261,31 @@ def test_a_held_out_photo_changes_no_answer_and_is_predicted(tmp_path, linked, s
     material = table(out)["materials"]["green"]
     reflectance = np.add(material["diffuse"], material["specular"]) / (MATERIALS.diffuse + MATERIALS.specular)[1]
     np.testing.assert_allclose(energy * reflectance / true, 1, atol=0.25)
+
+
+def test_the_background_of_a_held_out_photo_tells_its_light(tmp_path, linked):
+    """Where its surfaces, which face up, do not."""
+    photo = observations("d", [1], 7)
+    photo = photo.take(photo.normal[:, 1] < -0.3)
+    directions = lat_long_directions(32, 64)
+    below = directions[..., 1] < 0
+
+    def true(seed: int) -> np.ndarray:
+        return random_lobes(seed).radiance((directions @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(32, 64, 3)
+
+    light = {name: {"illumination": name, "world_from_camera": None, "held_out": name == "d"} for name in "abd"}
+    errors, tables = [], []
+    for seeds in ({"a": 1, "b": 2}, {"a": 1, "b": 2, "d": 7}):
+        folder = tmp_path / str(len(seeds)) / "urm/background"
+        folder.mkdir(parents=True)
+        for name, seed in seeds.items():
+            write_rgb_exr(folder / f"{name}.exr", true(seed) * below[..., None], LAT_LONG)
+        out = run(folder.parents[1], linked | {"d": photo}, light=light)
+        estimate = lat_long_of_lobes(read_lobes(out / "lobes.parquet")["d"], 32, 64)
+        errors.append(np.abs(np.log(estimate / true(7)))[below].mean())
+        tables.append(table(out))
+    assert tables[0] == tables[1] and tables[0]["model"]["background_chosen_by"]["b"]["kept"]
+    assert errors[1] < 0.8 * errors[0]
 
 
 def test_exposures_of_held_out_photos_follow_exif(tmp_path, linked):

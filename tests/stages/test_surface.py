@@ -22,6 +22,7 @@ from stages import surface
 from tests.evaluate.made_artifacts import Made, make_artifacts
 from tests.inference.made import observations_from_front
 from tests.refusal import refusal
+from tests.stages.made import ran
 
 SIZE = 12
 
@@ -119,7 +120,7 @@ def test_the_last_digits_of_estimated_normals_decide_nothing(tmp_path):
 
 
 def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
-    surface.main(surface.Params(shape="off"), Inputs({}), tmp_path, silent)
+    ran(surface, Inputs({}), tmp_path, shape="off")
     assert read_surface(tmp_path) == SurfaceTable() == read_surface(None)
     assert [path.name for path in tmp_path.iterdir()] == ["surface.json"]
 
@@ -146,9 +147,8 @@ def test_a_held_out_photo_takes_no_part_whatever_it_shows(tmp_path):
     results = []
     for name, shown in {"one": dusk, "other": other}.items():
         write_observations(inputs["urm"] / "dusk.parquet", shown)
-        (tmp_path / name).mkdir()
-        surface.main(surface.Params(observations=60), inputs, tmp_path / name, silent)
-        results.append([(tmp_path / name / file).read_bytes() for file in ("surface.json", "beginning.json")])
+        out = ran(surface, inputs, tmp_path / name, observations=60)
+        results.append([(out / file).read_bytes() for file in ("surface.json", "beginning.json")])
     assert results[0] == results[1]
 
 

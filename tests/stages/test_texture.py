@@ -1,5 +1,6 @@
 """The stage `texture`: paint comes back at every pixel and in the meshes of exports, and plain things stay plain."""
 
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -19,12 +20,12 @@ from factorlib.render.resynthesis import Reflector
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.texture_table import TextureTable, read_table, read_textures
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from stages import shading, texture
 from tests.export.made_export import light, write_obj
 from tests.refusal import refusal
 from tests.runner.toy import files_of
-from tests.stages.made import Rising
+from tests.stages.made import ran
 
 CAMERA = Camera(48, 48, 68.0, (24.0, 24.0))
 TURNS = {"a": 0.0, "b": 35.0, "c": -40.0}
@@ -80,14 +81,11 @@ def photographed(folder: Path, paint) -> Inputs:
     for name in TURNS:
         slices = facts | {"dataset.light": facts["dataset.light"][name]}
         of_photo = msgspec.structs.replace(inputs, facts=slices, photo=name)
-        shading.main(shading.Params(), of_photo, folders["shading"], silent)
+        ran(shading, of_photo, folders["shading"])
     return inputs
 
 
-def run(inputs: Inputs, out: Path, **params) -> Path:
-    out.mkdir()
-    texture.main(texture.Params(**params), inputs, out, Rising())
-    return out
+run = partial(ran, texture)
 
 
 @pytest.fixture(scope="module")

@@ -14,20 +14,15 @@ from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import copy_shipped
 from factorlib.stage import Inputs, silent
 from stages import train
+from tests.stages.made import Killed, ran
 
-BRIEF = train.Params(samples=8192, held_out=2048, steps=160, diffuse_steps=120, rate=0.01)
-TINY = train.Params(samples=1024, held_out=1024, steps=80, diffuse_samples=1024, diffuse_steps=80, batch=256)
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("trained")
-    train.main(BRIEF, Inputs({}), folder, silent)
-    return folder
+BRIEF = {"samples": 8192, "held_out": 2048, "steps": 160, "diffuse_steps": 120, "rate": 0.01}
+TINY = {"samples": 1024, "held_out": 1024, "steps": 80, "diffuse_samples": 1024, "diffuse_steps": 80, "batch": 256}
 
 
 @pytest.mark.long
-def test_a_brief_training_already_beats_the_formula_and_says_how(trained):
+def test_a_brief_training_already_beats_the_formula_and_says_how(tmp_path):
+    trained = ran(train, Inputs({}), tmp_path, silent, **BRIEF)
     accuracy = json.loads((trained / "accuracy.json").read_text())["specular"]
     assert accuracy["median"] < 0.013  # the formula's own, see tests/reflection
     assert set(accuracy) >= {"roughness", "sharpness", "cosine of the view", "degrees from the mirror direction"}
@@ -39,15 +34,9 @@ def test_a_brief_training_already_beats_the_formula_and_says_how(trained):
     assert reflection_operator("network", weights=trained).layers["specular"].weights[0].shape == (32, 24)
 
 
-class Killed(Exception):
-    pass
-
-
 def test_a_killed_training_goes_on_to_the_same_bytes(tmp_path):
     inputs, whole, points = Inputs({}, unfinished=tmp_path / "unfinished"), [], []
-    for name in ("whole", "out"):
-        (tmp_path / name).mkdir()
-    train.main(TINY, Inputs({}), tmp_path / "whole", lambda *words: whole.append(words[-1]))
+    ran(train, Inputs({}), tmp_path / "whole", lambda *words: whole.append(words[-1]), **TINY)
 
     def killed_amid_the_second_part(done, total, text=""):
         points.append(text)
@@ -55,9 +44,9 @@ def test_a_killed_training_goes_on_to_the_same_bytes(tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        train.main(TINY, inputs, tmp_path / "out", killed_amid_the_second_part)
+        ran(train, inputs, tmp_path / "out", killed_amid_the_second_part, **TINY)
     points.clear()
-    train.main(TINY, inputs, tmp_path / "out", lambda *words: points.append(words[-1]))
+    ran(train, inputs, tmp_path / "out", lambda *words: points.append(words[-1]), **TINY)
     second = [text for text in whole if text.startswith("specular")]
     assert all(text.startswith("specular") for text in points) and len(points) < len(second), "it started again"
     for path in (tmp_path / "whole").iterdir():

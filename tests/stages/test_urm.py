@@ -20,7 +20,7 @@ from factorlib.urm.observations import read_observations
 from factorlib.urm.reduction import sample
 from stages import urm
 from tests.align.scenes import ball, mesh_of
-from tests.stages.made import Rising
+from tests.stages.made import ran
 
 CAMERA = Camera(80, 60, 90.0, (40.0, 30.0))
 LEFT, RIGHT = Pose(np.eye(3), np.array([-1.05, 0.0, 6.0])), Pose(np.eye(3), np.array([1.05, 0.0, 6.0]))
@@ -58,9 +58,7 @@ def step(folder, poses: dict[str, Pose]):
 
 
 def run(folder, inputs, **params):
-    folder.mkdir()
-    urm.main(urm.Params(**params), inputs, folder, Rising())
-    return folder / "a.parquet"
+    return ran(urm, inputs, folder, **params) / "a.parquet"
 
 
 @pytest.fixture(scope="module")

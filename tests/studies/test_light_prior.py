@@ -7,7 +7,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import write_rgb_exr
 from factorlib.inference.material_prior import Classes
@@ -16,6 +15,7 @@ from factorlib.light.prior import LightPrior
 from studies.measured import light_prior, material_classes
 from studies.measured.light_prior import fit_prior, maps_in, mean_of, round_numbers
 from tests.light.test_light import KNOWN
+from tests.refusal import refusal
 
 
 def drawn(prior: LightPrior, cells, count: int, seed: int = 0):
@@ -50,8 +50,7 @@ def test_the_table_says_what_it_was_made_from_and_how_good_it_is(tmp_path, monke
     assert [source.name for source in prior.made_from] == ["a.exr", "b.exr", "c.exr"] and prior == round_numbers(prior)
     assert prior.made_from[0].sha256 == hashlib.sha256((folder / "a.exr").read_bytes()).hexdigest()
     assert prior.profile[0][0] > 0.5 and np.isfinite(prior.leave_one_out.prior)
-    with pytest.raises(InputError, match="no .hdr or .exr"):
-        maps_in([tmp_path])
+    refusal("no .hdr or .exr", maps_in, [tmp_path])
 
 
 def test_classes_are_fitted_to_a_table(tmp_path):

@@ -4,16 +4,15 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-import pytest
 import yaml
 from scipy.spatial import cKDTree
 
-from factorlib.errors import InputError
 from factorlib.meshes.read_mesh import read_mesh
 from studies.measured import gallery, results
 from studies.measured.degradations import degrade
 from studies.measured.eames_like import MAPS, split_maps
 from studies.measured.tools import ROOT, replace_sections
+from tests.refusal import refusal
 
 
 def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
@@ -29,8 +28,7 @@ def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
     assert "**Success**\n\n| case | right |\n|---|---:|\n| all | 1 of 1 |\n<!-- end align -->" in page.read_text(
         "utf-8"
     )
-    with pytest.raises(InputError, match="no place for the table 'other'"):
-        replace_sections(page, {"other": ""})
+    refusal("no place for the table 'other'", replace_sections, page, {"other": ""})
 
 
 def test_the_gallery_shows_every_recipe():
@@ -45,8 +43,7 @@ def test_a_prior_is_fitted_to_the_maps_that_light_no_photo():
     lit, others = split_maps(maps, 6)
     assert len(lit) == MAPS and sorted(lit + others) == maps
     assert split_maps(maps, 6) == (lit, others) and split_maps(maps, 7)[0] != lit
-    with pytest.raises(InputError, match="7 maps"):
-        split_maps(maps[:7], 6)
+    refusal("7 maps", split_maps, maps[:7], 6)
 
 
 def test_degraded_solids_keep_the_truth_of_what_they_show(tmp_path):
