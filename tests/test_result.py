@@ -22,6 +22,7 @@ from stages import recipes
 from tests.export import made_export
 from tests.refusal import refusal
 from tests.runner.toy import files_of
+from tests.stages.made import ran
 
 
 @pytest.fixture(scope="module")
@@ -197,10 +198,9 @@ ASKED = [
 @pytest.mark.parametrize("recipe, ask", ASKED)
 def test_pictures_that_recipes_make_are_the_same_files(result, tmp_path, recipe, ask):
     (drawn := ask(result)).save(tmp_path / "saved")
-    (out := tmp_path / "stage").mkdir()
     inputs = result._solved.inputs
     facts = inputs.facts | {"recipe": msgspec.to_builtins(recipe)}
-    recipes.main(recipes.Params(), msgspec.structs.replace(inputs, facts=facts), out, silent)
+    out = ran(recipes, msgspec.structs.replace(inputs, facts=facts), tmp_path / "stage", silent)
     assert files_of(tmp_path / "saved") == files_of(out) == drawn
     assert drawn._repr_html_().startswith('<img src="data:image/')
 

@@ -172,23 +172,16 @@ def test_fewer_pixels_and_an_unknown_focal_length_tell_normals_less_and_the_turn
 # ── What masks say of an object, how agreement is measured, and how far a normal is to be believed ──────────────────
 
 
-def label_of(number, labels, own_mask, label, owner=None, left_out=None):
-    """What the masks say of an object, or of the whole photo (number 0), in one row of pixels."""
-    none = [0] * len(label)
-    row = {"label": label, "object": owner or none, "left_out": left_out or none}
-    row = {name: np.array([values], float) for name, values in row.items()}
-    of = masks.silhouette_of_object(row, number, labels, own_mask) if number else masks.silhouette_of_photo(row)
-    return of.label[0].tolist()
-
-
-@pytest.mark.parametrize("of, expected", [
-    ((0, (), False, [0, 1, 0], None, [0, 0, 1]), [0, 1, UNKNOWN]),  # what is left out
-    ((1, (1, 3), False, [0, 1, 2, 3]), [0, 1, UNKNOWN, 3]),  # foreign materials may hide an object
-    ((1, (1,), True, [0, 1, 1, 1], [0, 1, 2, 0]), [0, 1, UNKNOWN, UNKNOWN]),  # own masks part objects of one material
-    ((2, (1,), False, [0, 1, 1, 1], [0, 1, 2, 0]), [0, UNKNOWN, 1, 1]),
+@pytest.mark.parametrize("of, label, owner, left_out, expected", [
+    ((), [0, 1, 0], [0, 0, 0], [0, 0, 1], [0, 1, UNKNOWN]),  # what is left out
+    ((1, (1, 3), False), [0, 1, 2, 3], [0] * 4, [0] * 4, [0, 1, UNKNOWN, 3]),  # foreign materials may hide an object
+    ((1, (1,), True), [0, 1, 1, 1], [0, 1, 2, 0], [0] * 4, [0, 1, UNKNOWN, UNKNOWN]),  # own masks part objects of one material
+    ((2, (1,), False), [0, 1, 1, 1], [0, 1, 2, 0], [0] * 4, [0, UNKNOWN, 1, 1]),
 ])  # fmt: skip
-def test_what_masks_say_of_an_object(of, expected):
-    assert label_of(*of) == expected
+def test_what_masks_say_of_an_object_or_of_the_whole_photo_in_one_row_of_pixels(of, label, owner, left_out, expected):
+    row = {"label": np.array([label]), "object": np.array([owner]), "left_out": np.array([left_out])}
+    silhouette = masks.silhouette_of_object(row, *of) if of else masks.silhouette_of_photo(row)
+    assert silhouette.label[0].tolist() == expected
 
 
 def test_agreement_is_one_for_the_truth_and_ignores_the_unknown():

@@ -23,7 +23,7 @@ from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobe_table import write_lobes
 from factorlib.stage import Inputs
 from stages import export
-from tests.stages.made import Rising
+from tests.stages.made import ran
 
 NAMES = ["red", "brass", "unseen"]
 MATERIALS = {
@@ -127,9 +127,8 @@ def make(folder: Path) -> Inputs:
 def make_exported(folder: Path) -> Inputs:
     """The same, and what `export` makes of it, at a small size: the inputs of `recipes`."""
     inputs = make(folder)
-    (folder / "export").mkdir()
-    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", Rising())
-    return Inputs({**inputs.folders, "export": folder / "export"}, inputs.facts, inputs.files)
+    exported = ran(export, inputs, folder / "export", height=16, mitsuba_height=16)
+    return Inputs({**inputs.folders, "export": exported}, inputs.facts, inputs.files)
 
 
 @cache

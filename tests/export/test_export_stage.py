@@ -4,6 +4,7 @@ import base64
 import json
 import struct
 import xml.etree.ElementTree as ET
+from functools import partial
 from io import BytesIO
 
 import msgspec
@@ -35,19 +36,14 @@ from tests.export import made_export
 from tests.export.test_textures import colours_at
 from tests.refusal import refusal
 from tests.runner.toy import files_of
+from tests.stages.made import ran
 
-SMALL = export.Params(height=32, mitsuba_height=32)
+run = partial(ran, export, progress=silent, height=32, mitsuba_height=32)
 
 
 @pytest.fixture
 def inputs(tmp_path):
     return made_export.make(tmp_path)
-
-
-def run(inputs, out, params=SMALL):
-    out.mkdir()
-    export.main(params, inputs, out, silent)
-    return out
 
 
 def test_exported_materials_in_exported_lights_are_the_solved_ones(inputs, tmp_path):

@@ -181,24 +181,18 @@ LAMBERTIAN = Reflectance((0.5, 0.4, 0.3), (0, 0, 0), 0.2)
 # as text -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def text_of(tmp_path):
-    """The text of a scene in which every object has every material."""
-
-    def written(objects=("chair",), materials=("red",), file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
-        place = np.arange(16.0).reshape(4, 4)
-        place[3] = [0, 0, 0, 1]
-        shapes = [ExportedShape(f"{name}.{each}", file, each, place, False) for name in objects for each in materials]
-        light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
-        scene = ExportedScene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
-        write_usd_scene(tmp_path / "scene.usda", scene)
-        return (tmp_path / "scene.usda").read_text()
-
-    return written
+def text_of(folder: Path, file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
+    """The text of a scene of one object."""
+    place = np.vstack([np.arange(12.0).reshape(3, 4), [0, 0, 0, 1]])
+    shape = ExportedShape("chair.red", file, "red", place, False)
+    light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
+    scene = ExportedScene(Camera(64, 48, 100.0, (30.0, 20.0)), [shape], {"red": GLOSSY}, light)
+    write_usd_scene(folder / "scene.usda", scene)
+    return (folder / "scene.usda").read_text()
 
 
-def test_files_are_quoted_matrices_written_for_rows_and_exposure_is_intensity_times_colour(text_of):
-    text, dark = text_of(), text_of(file="meshes/a@b.ply", exposure=(0, 0, 0))
+def test_files_are_quoted_matrices_written_for_rows_and_exposure_is_intensity_times_colour(tmp_path):
+    text, dark = text_of(tmp_path), text_of(tmp_path, "meshes/a@b.ply", (0, 0, 0))
     assert "references = @./meshes/a.usda@" in text and "references = @@@./meshes/a@b.usda@@@" in dark
     turned = "((0.0, -4.0, -8.0, 0.0), (1.0, -5.0, -9.0, 0.0), (2.0, -6.0, -10.0, 0.0), (3.0, -7.0, -11.0, 1.0))"
     assert f"matrix4d xformOp:transform = {turned}" in text

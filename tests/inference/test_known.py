@@ -133,12 +133,6 @@ def test_a_start_comes_to_the_scale_of_what_is_known_and_shows_the_same(solved):
 # ── lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def known_but(light: Light, unit: float, held: np.ndarray, scale_free: bool) -> Light:
-    """The light as a user knows it: in the photo's radiance, or in units of their own."""
-    weight = light.weight * (7.0 if scale_free else unit)
-    return msgspec.structs.replace(light, weight=weight, fixed=held, scale_free=scale_free)
-
-
 @pytest.mark.parametrize("scale_free", [True, False])
 def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_free):
     """Against finite differences along a step of its unknowns, of which known cells have at most their common factor."""
@@ -167,7 +161,8 @@ def test_a_light_that_is_known_gives_materials_their_absolute_scale_and_one_up_t
     problem, true = photographed(5, 2)
     tint = MATERIALS.diffuse / MATERIALS.diffuse.mean(1, keepdims=True)
     for scale_free, fixed in ((False, np.ones(FEW, bool)), (True, true[0].axis[:, 2] > -0.8)):
-        light = known_but(true[0], problem.blocks[0].unit, fixed, scale_free)
+        weight = true[0].weight * (7.0 if scale_free else problem.blocks[0].unit)  # the photo's, or units of their own
+        light = msgspec.structs.replace(true[0], weight=weight, fixed=fixed, scale_free=scale_free)
         one = msgspec.structs.replace(problem, known=KnownValues(lights={"room0": light}))
         start = insert_known(begun(one).point, one)
         change = np.log(start.materials.diffuse / START.diffuse)

@@ -284,16 +284,11 @@ def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alo
 # ── processes ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def sleeping(project):
-    """Whether a step of `upper` has written its files, and waits."""
-    return list((project.build / "store" / "tmp").glob("run-*/upper-*/a.txt"))
-
-
 def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsys):
     go = project.root / "go"
     toy.wait_for(project, go)
     first = start(project)
-    assert wait_until(lambda: sleeping(project))
+    assert wait_until(lambda: [*(project.build / "store" / "tmp").glob("run-*/upper-*/a.txt")]), "no step writes"
     verbs.show_status(project, verbs.Request("set"))
     assert re.search(r"^upper +[12] running", capsys.readouterr().out)
     refusal("a run is using this store", collect, project)

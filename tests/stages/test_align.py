@@ -1,7 +1,6 @@
 """The stage `align` from masks and dataset slices to its files, also where cameras are known beforehand."""
 
 import json
-import logging
 import warnings
 
 import msgspec
@@ -250,6 +249,5 @@ def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
 
 
 def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
-    with caplog.at_level(logging.WARNING, "factorlib.align"):
-        obj = aligned(scene(tmp_path / "set", mesh=blob()))["objects"]["chair"]
+    obj = aligned(scene(tmp_path / "set", mesh=blob()))["objects"]["chair"]
     assert obj["doubts"] and not obj["left_out"] and "world_from_object" in caplog.text

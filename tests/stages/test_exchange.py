@@ -17,7 +17,7 @@ from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.texture_table import TextureTable, read_table
 from factorlib.stage import Inputs, silent
 from stages import exchange, shading
-from tests.stages.made import Rising
+from tests.stages.made import ran
 from tests.stages.test_texture import TURNS, photographed, run, stripes
 
 
@@ -37,7 +37,7 @@ def painted(tmp_path_factory):
     for name in TURNS:
         facts = inputs.facts | {"dataset.light": inputs.facts["dataset.light"][name]}
         one = msgspec.structs.replace(inputs, facts=facts, photo=name)
-        shading.main(shading.Params(), one, inputs["shading"], silent)
+        ran(shading, one, inputs["shading"])
     texture = run(inputs, folder / "texture")
     assert read_table(texture).longest
     return msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": texture}), folder / "true"
@@ -59,7 +59,7 @@ def exchanged(monkeypatch, tmp_path, inputs: Inputs, solution) -> Inputs:
         shutil.copytree(solution, out, dirs_exist_ok=True)
 
     monkeypatch.setattr(stages.solve, "main", solve)
-    exchange.main(exchange.Params(), inputs, tmp_path, Rising())
+    ran(exchange, inputs, tmp_path)
     return with_exchange(msgspec.structs.replace(inputs, folders=inputs.folders | {"exchange": tmp_path}))
 
 
@@ -106,8 +106,7 @@ def test_a_photo_that_rejoins_is_solved_with_the_others_from_their_answer_withou
         (tmp_path / "plain").mkdir()
         write_json(tmp_path / "plain" / "texture.json", TextureTable())
         inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": tmp_path / "plain"})
-    (out := tmp_path / "out").mkdir()
-    exchange.main(exchange.Params(), inputs, out, silent)
+    out = ran(exchange, inputs, tmp_path / "out", silent)
     assert not read_result(out / FILE, Exchange, "exchange").kept
     assert solves[-1] == (list(TURNS), None, True) and len(solves) == 1 + textured
     after = with_exchange(msgspec.structs.replace(inputs, folders=inputs.folders | {"exchange": out}))
@@ -122,8 +121,6 @@ def test_nothing_is_solved_again_without_a_texture_or_by_the_papers_solver(tmp_p
         (tmp_path / "plain").mkdir()
         write_json(tmp_path / "plain" / "texture.json", TextureTable())
         inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": tmp_path / "plain"})
-    (tmp_path / "out").mkdir()
-    params = exchange.Params(solve=stages.solve.Params(solver=solver))
-    exchange.main(params, inputs, tmp_path / "out", silent)
-    assert read_result(tmp_path / "out" / FILE, Exchange, "exchange") == Exchange(False)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [FILE]
+    out = ran(exchange, inputs, tmp_path / "out", solve=stages.solve.Params(solver=solver))
+    assert read_result(out / FILE, Exchange, "exchange") == Exchange(False)
+    assert [path.name for path in out.iterdir()] == [FILE]

@@ -26,6 +26,7 @@ from stages import recipes
 from tests.export import made_export
 from tests.refusal import refusal
 from tests.runner.toy import files_of
+from tests.stages.made import ran
 
 ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
 WORLD = made_export.WORLD_FROM_CAMERA["side"]
@@ -43,9 +44,7 @@ def changed(inputs, fact, value):
 def drawn(inputs, out, recipe, **files):
     facts = {**inputs.facts, "recipe": msgspec.to_builtins(recipe)}
     files_by_field = {f"recipe file:{name}": path for name, path in files.items()}
-    out.mkdir()
-    recipes.main(recipes.Params(), Inputs(inputs.folders, facts, {**inputs.files, **files_by_field}), out, silent)
-    return files_of(out)
+    return files_of(ran(recipes, Inputs(inputs.folders, facts, {**inputs.files, **files_by_field}), out, silent))
 
 
 @pytest.fixture
@@ -78,16 +77,12 @@ def test_files_of_every_kind_and_the_same_bytes_again(grounded, tmp_path, recipe
     assert sorted(first) == sorted(files) and first == second
 
 
-@pytest.fixture
-def painted(grounded, tmp_path):
-    """The same with a texture of a half on the red of the egg."""
+def test_paint_stays_with_its_material_and_another_material_has_none(grounded, tmp_path):
+    """Of a texture of a half on the red of the egg."""
     egg = read_mesh(grounded.files["egg.obj"], made_export.NAMES, made_export.PARTS["egg"])
     write_factors(tmp_path / FACTORS, {("egg", "red"): np.full((subdivided_mesh(egg, 0.04).nodes, 3), 0.5)})
     write_json(tmp_path / FILE, TextureTable({"egg": 0.04}))
-    return Inputs({**grounded.folders, "texture": tmp_path}, grounded.facts, grounded.files)
-
-
-def test_paint_stays_with_its_material_and_another_material_has_none(painted, grounded, tmp_path):
+    painted = Inputs({**grounded.folders, "texture": tmp_path}, grounded.facts, grounded.files)
     results = SolvedSet(painted)
     shares = {kind: results.mesh("egg", kind, "y")[0].detail for kind in (None, "unseen")}
     assert 0.2 < (shares[None] == 0.5).mean() < 0.8 and (shares["unseen"] == 1).all()

@@ -149,8 +149,7 @@ def test_what_is_not_linked_or_not_observed_is_named_and_nothing_at_all_refused(
     out, text = earlier
     assert "'blue' is observed in no photo" in text
     assert min(table(out)["materials"]["blue"]["diffuse"]) > 0.01, "about as bright as the others"
-    with caplog.at_level(logging.WARNING):
-        run(tmp_path / "apart", {"a": linked["a"], "b": observations("b", [2], 2)})
+    run(tmp_path / "apart", {"a": linked["a"], "b": observations("b", [2], 2)})
     assert "2 sets that share no material" in caplog.text and "blue" in caplog.text
     refusal("no valid observation", run, tmp_path / "none", {"a": linked["a"].take(np.zeros(0, int))})
 
