@@ -40,7 +40,7 @@ from stages import evaluate, report
 from tests.evaluate.made_artifacts import Made, lobes_of, make_artifacts
 from tests.refusal import refusal
 from tests.runner import toy
-from tests.stages.made import Rising
+from tests.stages.made import Rising, ran
 
 LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
 CONTENTS = {"summary", "relight", "photos", "materials", "appearance", "reflectance", "lights", "errors", "solve", "poses", "training", "cost"}  # fmt: skip
@@ -79,17 +79,14 @@ class Strict(HTMLParser):
 
 def run(folder, log=LOG, **made) -> tuple[Inputs, str]:
     inputs = make_artifacts(Made(folder / "in", **made))
-    scored = folder / "evaluate"
-    scored.mkdir()
-    evaluate.main(evaluate.Params(), inputs, scored, Rising())
+    scored = ran(evaluate, inputs, folder / "evaluate")
     (folder / "log.jsonl").write_text("\n".join(json.dumps(e) for e in log))
     inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"evaluate": scored}, log=folder / "log.jsonl")
     return inputs, page_of(inputs, folder / "report")
 
 
 def page_of(inputs, out) -> str:
-    out.mkdir()
-    report.main(report.Params(), inputs, out, progress := Rising())
+    ran(report, inputs, out, progress := Rising())
     assert progress.moves >= len(inputs.facts["dataset.set"]["photos"]) + 3
     return (out / "index.html").read_text(encoding="utf-8")
 
