@@ -29,6 +29,7 @@ from stages import export
 from tests.export import made_export
 from tests.export.test_scenes import agree
 from tests.runner.toy import files_of
+from tests.stages.made import ran
 
 
 def colours_at(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -174,8 +175,7 @@ def folder(tmp_path_factory):
     write_factors(root / "texture" / FACTORS, {("egg", name): nodes for name in ("red", "brass")})
     inputs = msgspec.structs.replace(inputs, folders={**inputs.folders, "texture": root / "texture"})
     for name in ("export", "again"):
-        (root / name).mkdir()
-        export.main(export.Params(height=32, mitsuba_height=32), inputs, root / name, silent)
+        ran(export, inputs, root / name, silent, height=32, mitsuba_height=32)
     return root
 
 
