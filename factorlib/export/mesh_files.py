@@ -103,7 +103,7 @@ class MeshFiles:
         """
         mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
         pose = poses[obj.name]
-        cam_from_object = rigid(np.array(pose.rotation) * pose.scale, pose.translation)
+        cam_from_object = rigid(np.array(pose.rotation), pose.translation)
         key = (obj.mesh, *sorted(obj.materials.items()))
         if key not in self._stems:
             number = 1 + sum(other[0] == obj.mesh for other in self._stems)

@@ -17,7 +17,7 @@ from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import apply_tone, invert_tone
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.mesh import Mesh, scale_mesh, without_paint
+from factorlib.meshes.mesh import Mesh, without_paint
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, Table, ViewCamera, is_light_file, is_mesh_file, materials_of
@@ -305,7 +305,7 @@ class SolvedSet:
         pose = poses.objects[obj.name]
         mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
-        return PlacedMesh(obj.name, scale_mesh(mesh, pose.scale), tuple(self.names), place)
+        return PlacedMesh(obj.name, mesh, tuple(self.names), place)
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:

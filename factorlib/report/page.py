@@ -19,7 +19,6 @@ from factorlib.report.artifacts import STAGES, Artifacts
 from factorlib.report.template import headlines, render_template, sentences
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
-from factorlib.results.poses import AS_IT_IS
 
 LOW_IOU = 0.85  # silhouette overlap below which a pose is doubted
 MEASURES = {
@@ -106,7 +105,6 @@ def _facts(run: Artifacts, metrics: Metrics) -> dict[str, Any]:
         "poses": [(p, _overlay(run, p), poses[p], facts.get(p)) for p in run.set.photos if p in poses],
         "doubted": any(obj.doubts or obj.left_out for photo in poses.values() for obj in photo.objects.values()),
         "low_iou": LOW_IOU,
-        "as_it_is": AS_IT_IS,
         "lights": list(filter(None, lights)),
         "missing": {why: [name for _, name in group] for why, group in groupby(reasons, itemgetter(0))},
     }

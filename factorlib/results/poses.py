@@ -15,14 +15,12 @@ from factorlib.jsonfile import read_result
 from factorlib.results.materials import Vec3, vec3
 
 FILE = "poses.json"
-AS_IT_IS = (1.0, 1.0, 1.0)
-CURE = "name the folder of a result of `align`"
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class PoseEntry(msgspec.Struct, frozen=True):
-    """The pose cam_from_object: x_cam = rotation · (scale ∘ x_object) + translation, with the object's scale."""
+    """The pose cam_from_object: x_cam = rotation · x_object + translation."""
 
     rotation: tuple[Vec3, Vec3, Vec3]
     translation: Vec3
@@ -49,13 +47,11 @@ class ObjectPose(PoseEntry, frozen=True):
     """An object's pose and its measures of confidence (`factorlib.align.reliability`); None for what was not measured.
 
     Attributes:
-        scale: factors on the mesh's axes
-        source: origin of the pose: found, keypoints, refined (an earlier result), or who gave it
+        source: origin of the pose: found, keypoints, or who gave it
         doubts: reasons against the pose, in words
         left_out: True if the solve leaves the object out because of them
     """
 
-    scale: tuple[Positive, Positive, Positive] = AS_IT_IS
     silhouette_iou: float | None = None
     label_agreement: float | None = None
     source: str | None = None
@@ -63,7 +59,6 @@ class ObjectPose(PoseEntry, frozen=True):
     runner_up: RunnerUpPose | None = None
     contour_error: float | None = None
     normal_stderr_deg: float | None = None
-    mirrored_score: float | None = None
     doubts: list[str] = []
     left_out: bool = False
 
@@ -107,22 +102,22 @@ def pose_fields(pose: Pose) -> dict[str, Any]:
     return {"rotation": tuple(map(vec3, pose.rotation)), "translation": vec3(pose.translation)}
 
 
-def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
+def read_poses(path: str | Path) -> dict[str, PhotoPoses]:
     """Read poses.json: poses by photo; InputError if the file has another form."""
-    photos = read_result(path, dict[str, PhotoPoses], "align", cure)
+    photos = read_result(path, dict[str, PhotoPoses], "align")
     for name, photo in photos.items():
-        _check(photo, path, f"{name}.objects", cure)
+        _check(photo, path, f"{name}.objects")
     return photos
 
 
 def read_photo_poses(path: str | Path) -> PhotoPoses:
     """Read the poses of one photo as `align` writes them; InputError if the file has another form."""
     photo = read_result(path, PhotoPoses, "align")
-    _check(photo, path, "objects", "run the stage `align` again")
+    _check(photo, path, "objects")
     return photo
 
 
-def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
+def _check(photo: PhotoPoses, path: str | Path, key: str) -> None:
     for name, obj in photo.objects.items():
         for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
@@ -130,5 +125,5 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
                     "the pose is invalid: its rotation is not a rotation matrix, or a number is not finite",
                     file=path,
                     key=f"{key}.{name}",
-                    cure=cure,
+                    cure="run the stage `align` again",
                 )

@@ -83,7 +83,7 @@ class DatasetState:
         """Return the description of a stage with which a worker loads it."""
         stage = self.spec.pipeline.stages[name]
         cores = MOST_CORES if stage.cores == "all" else stage.cores
-        place = self.project.code_root, self.project.package, name
+        place = self.project.root, self.project.package, name
         return StageCode(*place, stage.values, self.project.pipeline_file, stage.threads, cores)
 
     def file_faults(self, steps: Iterable[Step]) -> list[str]:

@@ -21,7 +21,7 @@ def step_records(
     project: Project, spec: Spec, data: Data, hashes: FileHashes, recipes: dict[str, Recipe]
 ) -> tuple[dict[Step, Record], dict[Step, StepInputs]]:
     """Return every step's record without the results of other steps, and its inputs; files count by their content."""
-    sources = Sources([project.code_root, LIBRARY], hashes)
+    sources = Sources([project.root, LIBRARY], hashes)
     records: dict[Step, Record] = {}
     inputs: dict[Step, StepInputs] = {}
     for name in spec.pipeline.needed(spec.targets):

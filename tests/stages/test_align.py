@@ -125,31 +125,7 @@ def test_a_pose_behind_the_camera_is_refused_without_raw_warnings(tmp_path, z, k
     assert caught.key == "cameras.colmap: hall: vase"
 
 
-# ── earlier poses, and photos that were averaged down ────────────────────────────────────────────────────────────────
-
-
-def earlier(tmp_path, inputs, pose, camera, focal=300.0):
-    """The inputs, with a folder that names the pose."""
-    folder = tmp_path / "earlier"
-    folder.mkdir()
-    camera = {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)}
-    entry = {"camera": camera, "objects": {"chair": entry_of(pose, runner_up=None)}}
-    write_json(folder / "poses.json", {"a": entry})
-    return msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": folder})
-
-
-def test_an_earlier_pose_and_focal_length_are_used_as_they_are_unless_the_dataset_gives_one(tmp_path):
-    inputs, _, camera, pose = step(tmp_path, chair(), chair())
-    entry = run(tmp_path, earlier(tmp_path, inputs, pose, camera))[1]
-    obj = entry["objects"]["chair"]
-    assert is_at(obj, pose) and obj["source"] == "refined"
-    assert obj["score"] > 0.97 and obj["doubts"] == [] and obj["runner_up"] is None
-    assert entry["camera"]["focal_px"] == 300.0 and entry["camera"]["focal_source"] == "estimated"
-    (tmp_path / "given").mkdir()
-    inputs, _, camera, pose = step(tmp_path / "given", chair(), chair(), **KNOWN)
-    other = earlier(tmp_path / "given", inputs, Pose(np.eye(3), pose.translation), camera)
-    obj = run(tmp_path / "given", other)[1]["objects"]["chair"]
-    assert obj["source"] == "given" and np.allclose(obj["rotation"], pose.rotation)
+# ── photos that were averaged down ────────────────────────────────────────────────────────────────
 
 
 def in_a_file_twice_as_large(inputs, **camera):
@@ -161,13 +137,10 @@ def in_a_file_twice_as_large(inputs, **camera):
     return inputs
 
 
-def test_the_middle_and_an_earlier_focal_length_of_an_averaged_photo_are_those_of_its_file(tmp_path):
+def test_the_middle_of_an_averaged_photo_are_those_of_its_file(tmp_path):
     inputs, _, camera, pose = step(tmp_path, chair(), chair(), pose_given=True)
     entry = run(tmp_path, in_a_file_twice_as_large(inputs))[1]["camera"]
     assert entry["principal_point"] == [100.25, 75.0] and entry["focal_px"] == 300.0 and entry["factor"] == 2
-    del inputs.facts["dataset.objects"]["objects"][0]["pose"]
-    entry = run(tmp_path, earlier(tmp_path, inputs, pose, camera, focal=600.0), "again")[1]
-    assert entry["camera"]["focal_px"] == 300.0 and entry["objects"]["chair"]["silhouette_iou"] > 0.97
 
 
 def test_keypoints_and_principal_point_are_pixels_of_the_file(tmp_path):
