@@ -25,7 +25,6 @@ EXTRAS = {  # of modules that import what an extra alone installs
     ROOT / "factorlib" / f"{module}.py": extra
     for module, extra in (
         ("runner/worker", "dask"),
-        ("images/film", "video"),
         ("onboarding/matte", "masks"),
     )
 }

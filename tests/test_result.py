@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+import shutil
 
 import msgspec
 import numpy as np
@@ -88,6 +89,13 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
     refusal(r'load_result\("\.\."\)|load_result\("\.\./\.\./\.\./build/set"\)', factorlib.load_result, "../export")
     monkeypatch.chdir(tmp_path)
     refusal("make all DATASET=<name> makes one", factorlib.load_result, "nothing")
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    """Of the checkout."""
+    shutil.copytree(folder.parent.parent, tmp_path / "root")
+    return tmp_path / "root"
 
 
 @pytest.mark.parametrize("path, text, words", [

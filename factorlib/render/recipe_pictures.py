@@ -18,9 +18,8 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
-from factorlib.images.film import write_gif, write_mp4
 from factorlib.images.grain import add_grain
-from factorlib.images.picture import picture, write_png
+from factorlib.images.picture import picture, write_gif, write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import without_paint
 from factorlib.recipe import kinds
@@ -325,7 +324,7 @@ def write_animation(
 ) -> None:
     """Write an animation in which the camera or the light turns once.
 
-    Each frame is a PNG.  All frames are a GIF on white and, if PyAV is installed, an MP4 on white.
+    Each frame is a PNG.  All frames are a GIF on white.
 
     Args:
         recipe: the recipe to render
@@ -351,7 +350,6 @@ def write_animation(
     for k, each in enumerate(pixels):
         write_png(out / photo / f"{k:03}.png", each)
     write_gif(out / f"{photo}.gif", pixels, recipe.seconds)
-    write_mp4(out / f"{photo}.mp4", pixels, recipe.seconds)
 
 
 def write_relit(

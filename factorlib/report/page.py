@@ -34,7 +34,7 @@ FILES = {  # links of the page: stage and pattern of its files
     "lights, EXR": ("export", "illumination/*.exr"), "lights, HDR": ("export", "illumination/*.hdr"),
     "lights without their suns, EXR": ("export", "illumination/*_sky.exr"),
     "how sure lights are": ("export", "coverage/*.exr"), "Mitsuba scenes": ("export", "scenes/*.xml"),
-    "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"),
+    "Blender scenes": ("export", "scenes/blender.py"),
     "meshes": ("export", "meshes/*.ply"),
     "re-syntheses": ("render", "resynthesis/*.exr"), "metrics.json": ("evaluate", "metrics.json"),
 }  # fmt: skip

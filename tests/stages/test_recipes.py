@@ -1,7 +1,6 @@
 """The stage `recipes`: the files of every kind, what they show, the same bytes again, and what it refuses."""
 
 import json
-from importlib.util import find_spec
 
 import msgspec
 import numpy as np
@@ -57,13 +56,12 @@ def grounded(inputs):
 GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
 PICTURES = {"front": ["front.exr", "front.png"], "side": ["side.exr", "side.png"]}
 FRONT = {"photos": ["front"], "samples": 1}
-ANIMATED = ["front.gif", "front.mp4"] if find_spec("av") else ["front.gif"]
 KINDS = [
     (kinds.ResynthesisRecipe(samples=1), PICTURES["front"] + PICTURES["side"]),
     (kinds.ViewRecipe(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
     (kinds.ViewRecipe(photos=["side"], samples=1, azimuth=180, floor=0.5), [*PICTURES["side"], "side.json"]),
-    (kinds.TurntableRecipe(**FRONT, frames=3), [*ANIMATED, *(f"front/00{k}.png" for k in range(3))]),
-    (kinds.MovingLightRecipe(**FRONT, frames=2, width=16), [*ANIMATED, "front/000.png", "front/001.png"]),
+    (kinds.TurntableRecipe(**FRONT, frames=3), ["front.gif", *(f"front/00{k}.png" for k in range(3))]),
+    (kinds.MovingLightRecipe(**FRONT, frames=2, width=16), ["front.gif", "front/000.png", "front/001.png"]),
     (kinds.RelightRecipe(samples=1, rotate=30.0, photos=["side"]), ["side.json", *(f"side/{name}" for name in PICTURES["front"])]),
     (kinds.TransferRecipe(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
     (kinds.InsertRecipe(**FRONT), [*PICTURES["front"], "front.json"]),
