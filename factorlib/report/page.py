@@ -1,8 +1,7 @@
 """Content of the report's page, collected and rendered into the template."""
 
 import json
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
@@ -13,7 +12,6 @@ from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import data_uri, read_png
-from factorlib.jsonfile import read_json
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
 from factorlib.report.template import headlines, render_template, sentences
@@ -21,13 +19,6 @@ from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
 
 LOW_IOU = 0.85  # silhouette overlap below which a pose is doubted
-MEASURES = {
-    "median": "median",
-    "p95": "95th percentile",
-    "p99": "99th percentile",
-    "worst": "worst",
-    "samples": "samples",
-}
 FILES = {  # links of the page: stage and pattern of its files
     "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"),
     "objects, glTF": ("export", "*.glb"),
@@ -81,7 +72,6 @@ def page(
         texture=run.texture,
         exchange=run.exchange,
         surfaces=surfaces,
-        training=_training(run),
         cost=stage_costs(run.events(), STAGES),
         viewed=viewed,
         **_facts(run, metrics),
@@ -180,32 +170,6 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
         return None
     crop = pixels[pictures.mask_box(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
     return data_uri(pictures.downsample(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
-
-
-# ── Training ─────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _training(run: Artifacts) -> dict[str, Any] | None:
-    """Return the table of accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}.
-
-    `columns` are the measures that occur.  `lines` are (level, name, numbers), where level 0 is a network, 1 a quantity
-    and 2 a bin of it.
-    """
-    accuracy = run.read(read_json, "train", "accuracy.json")
-    if accuracy is None:
-        return None
-    columns = {key: title for key, title in MEASURES.items() if f"'{key}'" in str(accuracy)}
-    lines = [line for part, table in sorted(accuracy.items(), reverse=True) for line in _lines(part, table, 0)]
-    return {"columns": columns, "lines": lines}
-
-
-def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Mapping]]:
-    """Yield the lines of a table; bins are sorted by their leading numbers: "3 to 30" before "30 to 300"."""
-    yield level, name, table
-    leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
-    inner = [key for key, value in table.items() if isinstance(value, dict)]
-    for key in sorted(inner, key=lambda key: (float(number[0]) if (number := leading.match(key)) else 0.0, key)):
-        yield from _lines(key, table[key], level + 1)
 
 
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
