@@ -17,7 +17,6 @@ from factorlib.align.reliability import Thresholds, confidence, find_doubts, mea
 from factorlib.align.search import SearchOptions
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
 from factorlib.dataset.schema import SOURCES, ObjectsSlice
-from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
@@ -26,9 +25,7 @@ from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import CREASE_DEG, read_mesh
 from factorlib.meshes.triangle_soup import Limits
-from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, pose_fields
-from factorlib.results.shape_table import read_shapes
+from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, pose_fields, read_photo_facts, read_shapes
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
@@ -46,8 +43,6 @@ class Params(Thresholds, frozen=True, forbid_unknown_fields=True):
 
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
     """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
-    strict: bool = False
-    """Stop the run at a doubtful pose."""
     keep_doubtful: bool = False
     """Use objects with a doubtful estimated pose in the solve; otherwise they are left out."""
     limits: Limits = Limits()
@@ -83,7 +78,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         progress(len(objects) + k, pieces, f"{name}: how sure {obj.name} is")
         entries[obj.name] = object_entry(obj, k, result, maps, params, sources[k])
     for obj_name, entry in entries.items():
-        report_doubts(name, obj_name, entry, params.strict)
+        report_doubts(name, obj_name, entry)
     write_maps(out, name, channels, maps, [entry.left_out for entry in entries.values()])
     x, y = result.camera.centre
     focal = float(result.camera.focal)
@@ -180,16 +175,10 @@ def object_entry(
     )
 
 
-def report_doubts(photo: str, name: str, entry: ObjectPose, strict: bool) -> None:
-    """Warn of each doubt about a pose.
-
-    Raises:
-        InputError: With `strict`, for the first doubt.
-    """
+def report_doubts(photo: str, name: str, entry: ObjectPose) -> None:
+    """Warn of each doubt about a pose."""
     cure = EXTERNAL_CURE if entry.source in (*SOURCES, "sfm") else CURE
     for reason in entry.doubts:
-        if strict:
-            raise InputError(reason, file="dataset.yaml", key=f"{photo}.{name}", cure=cure)
         log.warning("%s: %s: %s; %s", photo, name, reason, cure)
     if entry.left_out:
         log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, name)

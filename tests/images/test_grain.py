@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from factorlib.images.grain import add_grain, grain_covariance
 from factorlib.images.tone import srgb_decode, srgb_encode
+from factorlib.render.recipe_pictures import add_grain, grain_covariance
 
 RNG = np.random.default_rng(3)
 ROWS, COLUMNS = np.mgrid[:300, :400] / 400

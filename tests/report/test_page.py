@@ -13,24 +13,22 @@ import pytest
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
+from factorlib.report.page import sentences
 from factorlib.report.pictures import downsample
-from factorlib.report.template import sentences
-from factorlib.results.exchange import Exchange
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import (
     FitStatus,
     Model,
     read_materials,
 )
-from factorlib.results.surface_table import DetailEvidence
-from factorlib.results.texture_table import TextureEvidence, TextureTable
+from factorlib.results.texture_table import DetailEvidence, Exchange, TextureEvidence, TextureTable
 from factorlib.stage import Inputs
 from stages import evaluate, report
 from tests.evaluate.made_artifacts import Made, lobes_of, make_artifacts
 from tests.stages.made import Rising
 
 LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
-CONTENTS = {"summary", "relight", "photos", "materials", "appearance", "reflectance", "lights", "errors", "solve", "poses", "cost"}  # fmt: skip
+CONTENTS = {"summary", "relight", "photos", "materials", "appearance", "lights", "errors", "solve", "poses", "cost"}  # fmt: skip
 VOID = {"meta", "img", "br", "link", "input", "hr", "source"}
 OURS = re.compile(r"<script( type=\"application/json\" id=\"viewer-data\")?>.*?</script>", re.DOTALL)
 SVG_LEAVES = {"line", "polyline", "circle", "path", "rect"}
@@ -119,8 +117,8 @@ def test_it_is_well_formed_has_every_section_and_asks_for_nothing_outside_the_fi
 def test_every_picture_decodes_and_says_what_it_is(report_page, tmp_path):
     result = parsed(report_page[2])
     pictures = [link for link in result.links if link.startswith("data:")]
-    # of the first screen, photos × panels, materials, balls, measured and solved maps, lights × (map, darker, truth, spheres), overlays
-    assert len(pictures) == 3 + 3 * 4 + 3 + 9 + 5 + 9 + 3 * 4 + 3
+    # of the first screen, photos × panels, materials, balls, lights × (map, darker, truth, spheres), overlays
+    assert len(pictures) == 3 + 3 * 4 + 3 + 9 + 3 * 4 + 3
     for k, uri in enumerate(pictures):
         path = tmp_path / f"{k}.png"
         path.write_bytes(base64.b64decode(uri.split(",")[1], validate=True))

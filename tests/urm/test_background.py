@@ -6,7 +6,7 @@ import pytest
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.ground import Plane
-from factorlib.urm.background import RIM, ROWS, surrounding_radiance
+from factorlib.urm.extract import RIM, ROWS, surrounding_radiance
 
 CAMERA = Camera(160, 120, 110.0, (80.0, 60.0))
 UP = np.array([0.0, -np.cos(0.4), -np.sin(0.4)])  # the camera looks down by 23°
