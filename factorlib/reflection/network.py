@@ -21,8 +21,9 @@ from torch import Tensor
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.reflection import closed_form
+from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fading, specular_columns
 from factorlib.reflection.filtering import Filtered, filtered_specular
-from factorlib.reflection.fused import LARGEST, Layers, diffuse_columns, fading, fused, specular_columns
+from factorlib.reflection.fused import fused
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST, Operator, Response, columns
 from factorlib.wholefile import write_bytes
