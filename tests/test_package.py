@@ -20,14 +20,9 @@ OURS = {"factorlib", "stages", "tests", "studies"}
 PACKED = ["factorlib", "stages", "recipes", "pipeline.yaml", "pyproject.toml", "README.md", "LICENSE"]
 
 
-# What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
-EXTRAS = {  # of modules that import what an extra alone installs
-    ROOT / "factorlib" / f"{module}.py": extra
-    for module, extra in (
-        ("runner/worker", "dask"),
-        ("onboarding/matte", "masks"),
-    )
-}
+EXTRAS = {
+    ROOT / "factorlib" / "onboarding" / "matte.py": "masks"
+}  # of modules that import what an extra alone installs
 
 
 @pytest.mark.parametrize("folder", ["factorlib", "stages"])
