@@ -163,7 +163,7 @@ def test_keypoints_are_pixels_of_the_photo_before_its_lens_was_undone(tmp_path):
     channels, result = read_exr(inputs["masks"] / "a.exr"), []
     for camera in (known, known | {"distortion": None}):
         given = msgspec.convert({**slice_, "camera": camera}, ObjectsSlice)
-        result.append(align.read_objects(given, channels, inputs, align.Params(), 2, None)[0].keypoints.pixel)
+        result.append(align.read_objects(given, channels, inputs, align.Params(), 2)[0].keypoints.pixel)
     bent = (result[1] - [100.25, 75.0]) / 300
     assert np.abs(result[1] - result[0]).max() > 1
     straight = (result[0] - [100.25, 75.0]) / 300
