@@ -20,7 +20,7 @@ from tests.runner.toy import call, files_of, make, state, write
 # ── DATASET ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 NO_NAMES = [
-    "", "/", "//", ".", "..", "./", "../", "../..", "store", "bench", "studies", "compare", "data/..", "build/store",
+    "", "/", "//", ".", "..", "./", "../", "../..", "store", "bench", "studies", "data/..", "build/store",
     "loop", "data/loop", "loop/set", "x" * 256, "data/" + "y" * 300, "a/" * 3000, "nul\0", "data/nul\0/x", "\udcff",
 ]  # fmt: skip
 NOBODYS = ["mine", "data", "nowhere", "elsewhere/set", "/nowhere/set", "../set", "data/elsewhere/../../set", "stages"]
