@@ -1,6 +1,8 @@
-"""Report of the run: index.html, a page that needs no other file and no network.
+"""Report of the run: a self-contained page, and a figure of each photo as PNG.
 
-Except for the section on cost, it has the same bytes in every run.
+Writes index.html, which needs no other file and no network, and for each photo figures/photos/<photo>.png: photo,
+materials, re-synthesis and difference side by side.  Except for the section on cost, the page has the same bytes in
+every run.
 """
 
 from itertools import count
@@ -12,11 +14,11 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
 from factorlib.render.solved_set import SolvedSet
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
-from factorlib.report.pictures import exposures, first_pictures, material_tags, photo_row, surface_rows
+from factorlib.report.pictures import exposures, first_pictures, material_tags, photo_row, strip, surface_rows
 from factorlib.report.viewer import viewer_data
 from factorlib.results.texture_table import with_exchange
 from factorlib.stage import Inputs, Progress
-from factorlib.wholefile import write_text
+from factorlib.wholefile import write_bytes, write_text
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -24,7 +26,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Write the page."""
+    """Write the page and its figures."""
     inputs = with_exchange(inputs)
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
     metrics = run.metrics
@@ -32,11 +34,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     errors = metrics.photos
     rows = []
     tags = material_tags(run)
+    (out / "figures" / "photos").mkdir(parents=True)
     total = len(run.set.photos) + 4
     counter = count()
     for name in run.set.photos:
         progress(next(counter), total, name)
         rows.append(photo_row(run, name, tags, errors.get(name)))
+        write_bytes(out / "figures" / "photos" / f"{name}.png", strip(rows[-1]))
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     progress(next(counter), total, "viewer")

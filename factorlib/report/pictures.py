@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.evaluate.picture_errors import agreeing_pixels
-from factorlib.images.picture import data_uri, exposure_of, nearest_tags, picture
+from factorlib.images.picture import data_uri, exposure_of, nearest_tags, picture, png_bytes
 from factorlib.images.tone import srgb_encode
 from factorlib.render.photo_scene import TracedPicture, rotate_light, traced_photo
 from factorlib.render.solved_set import SolvedSet
@@ -92,12 +92,14 @@ class PhotoRow(msgspec.Struct, frozen=True):
     """A photo with its panels and errors.
 
     Attributes:
-        uris: panels of one crop as `data:` URIs, by title
+        panels: sRGB pixels of one crop, by title
+        uris: the panels as `data:` URIs
         errors: errors of the re-synthesis, if there are any
     """
 
     name: str
     illumination: str
+    panels: dict[str, Pixels]
     uris: dict[str, str]
     errors: PhotoErrors | None
 
@@ -143,7 +145,7 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
         panels["difference"] = np.concatenate([np.clip(difference, 0, 1), in_mask[..., None]], axis=-1)
     longest = longest_side(len(run.set.photos))
     pixels = {k: np.rint(255 * np.clip(downsample(v, longest), 0, 1)).astype(np.uint8) for k, v in panels.items()}
-    return PhotoRow(name, run.illumination_of(name), {k: data_uri(v) for k, v in pixels.items()}, errors)
+    return PhotoRow(name, run.illumination_of(name), pixels, {k: data_uri(v) for k, v in pixels.items()}, errors)
 
 
 def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet) -> list[tuple[str, str, str]]:
@@ -238,6 +240,14 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[di
         moved = {"typical": float(np.sqrt(np.mean(size**2))), "largest": float(size.max())}
         rows.append({"mesh": mesh, "photo": photo, "uris": uris, **moved})
     return rows
+
+
+def strip(row: PhotoRow) -> bytes:
+    """Return a row's panels side by side on white, as a PNG."""
+    panels = [pixels.astype(np.float32) for pixels in row.panels.values()]
+    alphas = [each[..., 3:] / 255 if each.shape[2] == 4 else 1.0 for each in panels]
+    opaque = [each[..., :3] * alpha + 255 * (1 - alpha) for each, alpha in zip(panels, alphas)]
+    return png_bytes(np.rint(np.concatenate(opaque, axis=1)).astype(np.uint8))
 
 
 # ── Materials in lights ──────────────────────────────────────────────────────────────────────────────────────────────

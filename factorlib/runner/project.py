@@ -25,7 +25,7 @@ from factorlib.yamlfile import parse_yaml, read_yaml
 DATASET_CURE = "name a folder in data/, or give the path of a folder with a dataset.yaml"
 PIPELINE = "pipeline.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
-RESERVED = ("studies", "bench", "store", "docs")  # folders of build/ that are not datasets
+RESERVED = ("studies", "bench", "store", "compare", "docs")  # folders of build/ that are not datasets
 log = logging.getLogger("factorlib.runner")
 LONGEST = 200  # bytes of the name of a dataset or recipe
 SHARED = "FACTORLIB_STORE"  # environment variable: folder of a store that several checkouts share

@@ -139,6 +139,10 @@ def test_only_the_cost_section_depends_on_the_log(report_page, tmp_path):
     without = [re.sub(r"<!-- begin cost.*end cost -->", "", text, flags=re.DOTALL) for text in (again, html)]
     assert without[0] == without[1] and again != html
     assert "1 min 23 s" in html and "photo &#39;day&#39; &lt;is&gt; dark" in html
+    figures = [
+        sorted((folder / "figures").rglob("*.png")) for folder in (report_page[0] / "report", tmp_path / "again")
+    ]
+    assert [p.read_bytes() for p in figures[0]] == [p.read_bytes() for p in figures[1]] and len(figures[0]) == 3
 
 
 @pytest.mark.parametrize(
