@@ -102,6 +102,7 @@ help-all:
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
 	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX'
 	@echo '     EXTRAS=masks                     and the network of automatic masks (docs/photos.md)'
+	@echo '     EXTRAS=dask                      and Dask: SET="executor=tcp://…" runs steps on a cluster (docs/distributed.md)'
 
 .DEFAULT:
 	@test -e .venv/ready || $(MAKE) setup

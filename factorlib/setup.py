@@ -5,7 +5,7 @@ The Makefile runs it as a script, on a Python without packages, so only the stan
 pip where uv is not available.
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for another PyTorch, e.g. with CUDA)
-    .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="masks blender": extras of pyproject.toml, into .venv)
+    .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="dask blender": extras of pyproject.toml, into .venv)
     .venv/bin/python -I factorlib/setup.py lock          (requirements.lock: the requirements of pyproject.toml, and
                                                          theirs, pinned to the versions in .venv)
 

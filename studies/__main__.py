@@ -26,14 +26,14 @@ def study_command(
         bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew, of full studies")
     ] = False,
 ) -> None:
-    """Run the steps of studies that are not current, or all with FORCE=1."""
+    """Run the steps of studies that are not current, or all with FORCE=1; SET="executor=tcp://…" names the executor."""
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
     scale = QUICK if switched_on("QUICK", quick) else FULL
     for name in named:
         studies(scale).dataset_folder(name)
-    code = make(scale, named or list(STUDIES), switched_on("FORCE", False))
+    code = make(scale, named or list(STUDIES), switched_on("FORCE", False), [os.environ.get("SET", "")])
     if docs and code == 0 and not scale.quick:
         from studies.run.tables import refresh_docs
 

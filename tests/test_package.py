@@ -20,9 +20,14 @@ OURS = {"factorlib", "stages", "tests", "studies"}
 PACKED = ["factorlib", "stages", "recipes", "pipeline.yaml", "pyproject.toml", "README.md", "LICENSE"]
 
 
-EXTRAS = {
-    ROOT / "factorlib" / "onboarding" / "matte.py": "masks"
-}  # of modules that import what an extra alone installs
+# What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
+EXTRAS = {  # of modules that import what an extra alone installs
+    ROOT / "factorlib" / f"{module}.py": extra
+    for module, extra in (
+        ("runner/worker", "dask"),
+        ("onboarding/matte", "masks"),
+    )
+}
 
 
 @pytest.mark.parametrize("folder", ["factorlib", "stages"])

@@ -20,7 +20,7 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text
 from factorlib.reading import one_line
-from factorlib.yamlfile import parse_yaml, read_yaml
+from factorlib.yamlfile import convert, parse_yaml, read_yaml
 
 DATASET_CURE = "name a folder in data/, or give the path of a folder with a dataset.yaml"
 PIPELINE = "pipeline.yaml"
@@ -253,6 +253,9 @@ class StageCode(msgspec.Struct, frozen=True):
 StageName = Annotated[str, msgspec.Meta(pattern="^[a-z][a-z0-9_]*$", description="rename it: a-z, 0-9 and _")]
 MOST_CORES = 1024
 DEEPEST = 16  # parts of the name of a setting
+EXECUTORS = "write processes, or the address of a Dask scheduler, such as tcp://10.0.0.1:8786"
+EXECUTOR_PATTERN = r"^(processes|(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+)$"
+Executor = Annotated[str, msgspec.Meta(pattern=EXECUTOR_PATTERN, description=EXECUTORS)]
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
@@ -324,10 +327,14 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of pipeline.yaml."""
+    """Content of pipeline.yaml.
+
+    executor: `processes` of this machine, or the address of a Dask scheduler; it changes no bit and no key
+    """
 
     format: Literal[1]
     stages: dict[StageName, Stage]
+    executor: Executor = "processes"
 
     def order(self) -> list[str]:
         """Return the stages in a topological order, the same in every run."""
@@ -394,7 +401,7 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
 
 def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
-    """Replace values of the pipeline by settings `stage.parameter=value`, several separated by blanks.
+    """Replace values of the pipeline by settings `stage.parameter=value` and `executor=…`, several separated by blanks.
 
     `stage.preset=name` stands for the parameters of a preset; a later setting replaces one of these.
 
@@ -408,9 +415,13 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
     {'solve': {'lobes': 64}}
     """
     stages = dict(pipeline.stages)
+    executor = pipeline.executor
     for word in _words(settings):
         target, equals, text = word.partition("=")
         key = f"SET {one_line(word)}"
+        if target == "executor":
+            executor = convert(text, Executor, key)
+            continue
         stage, *names = target.split(".")
         if not equals or not all(names) or not 0 < len(names) <= DEEPEST:
             cure = 'write stage.parameter=value, as in SET="solve.cells=800"'
@@ -436,7 +447,7 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
     for name, each in stages.items():
         shared = {of: stages[of].values for of in each.params_of}
         stages[name] = msgspec.structs.replace(each, params=each.params | shared)
-    return msgspec.structs.replace(pipeline, stages=stages)
+    return msgspec.structs.replace(pipeline, stages=stages, executor=executor)
 
 
 def _value(text: str, key: str) -> Any:

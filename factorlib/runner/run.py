@@ -48,7 +48,7 @@ def run(state: DatasetState, display: Display) -> Run:
     folder, alive = begin_run(state.store)
     with contextlib.ExitStack() as stack:
         stack.callback(end_run, folder)
-        workers = Workers(folder)
+        workers = Workers(state.spec.pipeline.executor, folder, display.report)
         stack.callback(workers.close)
         stack.callback(alive.release)  # Processes of unfinished steps end then.
         current = Run(state, display, folder, workers)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 LOCK = "lock"  # in the folder of a run, which holds it
 ABANDONED = 86400.0  # seconds without a change after which a draft outside a run is of a killed process
+ENDING = 10.0  # most seconds that processes of a cluster take to end with their run
+PAUSE = 0.05  # seconds between two tries to delete a folder
 
 
 def begin_run(store: Store) -> tuple[Path, BaseFileLock]:
@@ -33,8 +35,11 @@ def begin_run(store: Store) -> tuple[Path, BaseFileLock]:
 
 
 def end_run(folder: Path) -> None:
-    """Delete a run's folder."""
-    shutil.rmtree(folder, ignore_errors=True)
+    """Delete a run's folder; processes of a cluster that end with the run may still write to it for a moment."""
+    end = time.monotonic() + ENDING
+    while folder.exists() and time.monotonic() < end:
+        shutil.rmtree(folder, ignore_errors=True)
+        time.sleep(PAUSE if folder.exists() else 0.0)
 
 
 @contextlib.contextmanager

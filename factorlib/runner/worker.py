@@ -1,12 +1,12 @@
-"""Steps in processes.
+"""Steps in processes: of this machine, or of the workers of a Dask cluster.
 
 The number of threads of a library and the order in which sets are walked are fixed when a process starts, and results
 depend on both.  Each process is therefore started for one number of threads, in an environment of its own, with the
 modules that are on disk at that time, and runs one step at a time.  A crash in a library or a lack of memory ends that
 process alone.  A process ends with the one that started it, and with its run, whose lock it watches.
 
-A task has keys and paths, never arrays, and its outcome is always an `Outcome`.  A running step writes progress and
-warnings to a file of events.
+A task has keys and paths, never arrays, and its outcome is always an `Outcome`, so that an executor needs only
+`submit`.  A running step writes progress and warnings to a file of events.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
+from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import ModuleType
@@ -206,7 +207,8 @@ def _check_code(task: Task, store: Store) -> None:
     if changes := difference(before, closure.record):
         names = sorted(name for name in closure.files if before.get(name) != closure.record[name])
         fault = f"the code changed while the run went on ({'; '.join(changes)})"
-        raise InputError(fault, file=", ".join(str(closure.files[name]) for name in names) or None, cure="run again")
+        cure = "run again; a worker of a cluster needs the same checkout and the same packages"
+        raise InputError(fault, file=", ".join(str(closure.files[name]) for name in names) or None, cure=cure)
 
 
 class Meter:
@@ -292,38 +294,57 @@ FIXED = {
     "PYTHONWARNINGS": "ignore:resource_tracker",  # Python reports semaphores of a killed run as leaked.
     "OMP_WAIT_POLICY": "PASSIVE",  # Threads that wait by spinning slow down others.
 }
+TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long.
 WATCH = 0.3  # seconds between two checks that the run goes on
+PATIENCE = 10  # seconds to reach a scheduler
+AHEAD = 200  # most steps submitted to a cluster at a time; each holds an open lock file
+TRIES = 3  # of a step whose process or worker dies, on a cluster
 _starting = threading.Lock()  # held while a process starts, because the environment is changed
 _this_thread = threading.local()  # the process of a thread, and its run and number of threads
 
 
 class Workers:
-    """Executor of steps, each in a process.
+    """Executor of steps, each in a process: on this machine, or on the workers of a Dask scheduler.
 
     Attributes:
-        capacity: number of cores that may be busy at once
+        capacity: number of cores (of a cluster: of steps) that may be busy at once
+
+    Raises:
+        InputError: No scheduler answers, or Dask is not installed.
     """
 
-    def __init__(self, run: Path | None = None):
+    def __init__(self, address: str = "processes", run: Path | None = None, report: Callable[[str], None] = print):
         self.run = run
-        self.capacity = usable_cores()
+        self.client = None
         self._busy: dict[Future, int] = {}
-        self._executor = ThreadPoolExecutor(self.capacity)
+        if address == "processes":
+            self.capacity = usable_cores()
+            self._executor: Any = ThreadPoolExecutor(self.capacity)
+        else:
+            self.capacity = AHEAD
+            self.client = connect(address)
+            self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
+            report(f"steps go to {address} and wait there for a worker: .venv/bin/dask worker {address}")
 
     def free(self, cores: int) -> bool:
         """Return True if a step of `cores` cores may start: they are free, or no other step runs."""
         self._busy = {future: count for future, count in self._busy.items() if not future.done()}
-        return not self._busy or sum(self._busy.values()) + cores <= self.capacity
+        return not self._busy or sum(self._busy.values()) + (1 if self.client else cores) <= self.capacity
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores."""
         future = self._executor.submit(compute_in_process, self.run, threads, function, argument)
-        self._busy[future] = cores
+        self._busy[future] = 1 if self.client else cores
         return future
 
     def close(self) -> None:
         """End the processes: at once if the run's lock is free, else after the steps that they run."""
-        self._executor.shutdown()
+        if self.client is None:
+            return self._executor.shutdown()
+        if not all(future.done() for future in self._busy):
+            time.sleep(2 * WATCH)
+        self._executor.shutdown(wait=False)
+        self.client.close()
 
 
 def usable_cores() -> int:
@@ -331,8 +352,32 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def connect(scheduler: str) -> Any:
+    """Return a Dask client; InputError if Dask is not installed or no scheduler answers."""
+    if find_spec("distributed") is None:
+        cure = "install it: make setup EXTRAS=dask, or, in the checkout, pip install '.[dask]'"
+        raise InputError("Dask is not installed", key="executor", cure=cure)
+    from distributed import Client
+
+    for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # The outcome of a step reports a lost connection.
+    try:
+        return Client(scheduler, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # Anything may answer there, such as an HTTP server.
+        cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
+        fault = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
+        raise InputError(fault, key="executor", cure=cure) from error
+
+
 def compute_in_process(run: Path | None, threads: int, function: Callable, argument: Any) -> Any:
-    """Compute `function(argument)` in the process of this thread, which is started for a run and number of threads."""
+    """Compute `function(argument)` in the process of this thread, which is started for a run and number of threads.
+
+    Raises:
+        InputError: This machine does not have the run's folder.
+    """
+    if run is not None and not run.is_dir():
+        cure = "keep build/ and the data on a file system that all machines mount at the same path"
+        raise InputError(f"the worker on {os.uname().nodename} does not see the run's folder", file=run, cure=cure)
     if getattr(_this_thread, "started_for", None) != (run, threads):
         _this_thread.pool = _start_process(run, threads)
         _this_thread.started_for = (run, threads)
@@ -345,10 +390,12 @@ def compute_in_process(run: Path | None, threads: int, function: Callable, argum
 
 def _start_process(run: Path | None, threads: int) -> ProcessPoolExecutor:
     """Start a process in an environment that fixes the order of sets and the threads of libraries."""
+    multiprocessing.current_process().daemon = False  # A process of Dask's nanny may start none.
     pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_process, (run,))
     with _starting:
         before = dict(os.environ)
         os.environ.update(FIXED | dict.fromkeys(THREAD_VARIABLES, str(threads)))
+        os.environ.pop(TRIM, None)
         try:
             resource_tracker.ensure_running()  # It unblocks SIGINT.
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # The process inherits that: it never gets one.

@@ -72,10 +72,14 @@ def data_of(folder: Path, scale: Scale) -> Data:
     return Data(folder, list(cases), slice_)
 
 
-def make(scale: Scale, names: list[str], force: bool = False, root: Path = LIBRARY) -> int:
+def make(
+    scale: Scale, names: list[str], force: bool = False, settings: list[str] | None = None, root: Path = LIBRARY
+) -> int:
     """Run the steps of studies that are not current.
 
     Their results lie in build/studies afterwards.
+
+    settings: where their steps run, as `executor=tcp://…`
 
     A failed study does not stop the others.  Returns the exit code of the first failed study; 0 if none failed.
     """
@@ -85,7 +89,7 @@ def make(scale: Scale, names: list[str], force: bool = False, root: Path = LIBRA
         study = STUDIES[name]
         if scale.quick:
             print(f"{name}: quick: one seed, smallest sets: no conclusion")
-        request = verbs.Request(name, targets=list(study.steps), force=force)
+        request = verbs.Request(name, targets=list(study.steps), settings=settings or [], force=force)
         codes.append(verbs.make(project, request))
         if codes[-1] == 0:
             from studies.run.tables import write_study  # here: a plan must not pay for science

@@ -1,6 +1,7 @@
 """Real runs of a toy pipeline: what runs, what is kept, what is shown, what survives."""
 
 import fcntl
+import itertools
 import json
 import re
 import shutil
@@ -13,7 +14,8 @@ from factorlib.runner import display, verbs
 from factorlib.runner.plan import Step
 from factorlib.runner.project import Pipeline, Stage, with_settings
 from factorlib.runner.results_folder import clean
-from factorlib.runner.store import is_locked, lock
+from factorlib.runner.run_folder import begin_run, end_run
+from factorlib.runner.store import Store, is_locked, lock
 from tests.faults.test_kills import start, wait_until
 from tests.refusal import refusal
 from tests.runner import toy
@@ -289,6 +291,21 @@ def test_a_given_folder_is_read_and_counts_by_content_not_by_place(giving, tmp_p
     assert str(tmp_path) not in "".join(path.read_text() for path in (giving.build / "store" / "keys").iterdir())
     edit(giving, "stages/table.py", "    (out", "    (inputs['start'] / 'seed.txt').write_text('9')\n    (out")
     assert make(giving, one) == 1, "what changes while it is read is no result"
+
+
+def test_the_folder_of_a_run_goes_even_if_a_step_writes_to_it_while_it_is_deleted(tmp_path, monkeypatch):
+    folder, alive = begin_run(Store(tmp_path / "store"))
+    alive.release()
+    delete, late = shutil.rmtree, iter("12")
+
+    def delete_while_one_writes(path, ignore_errors):
+        delete(path)
+        for name in itertools.islice(late, 1):
+            (path / name).mkdir(parents=True)
+
+    monkeypatch.setattr(shutil, "rmtree", delete_while_one_writes)
+    end_run(folder)
+    assert not folder.exists() and not list(late)
 
 
 def test_two_that_ask_whether_a_run_lives_do_not_take_each_other_for_it(tmp_path):
