@@ -11,10 +11,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new photos label compare validate verify clean gc pack setup lock test check-types run-tests test-long docs results study studies data help help-all $(STAGES)
+.PHONY: all plan why status params new photos label validate verify clean setup lock test check-types run-tests test-long docs results study studies data help help-all $(STAGES)
 
 # each reads DATASET, SET, HELD_OUT and FORCE from the environment
-all plan why status graph logs params new photos label compare validate verify gc pack $(STAGES): .venv/ready
+all plan why status params new photos label validate verify $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 clean: .venv/ready
@@ -87,14 +87,9 @@ help-all:
 	@echo 'make photos DATASET=mychair PHOTOS=… [MESHES=…] [MATTE=<file.onnx>] [WHOLE=1]   the same with automatic masks, cameras and a hull'
 	@echo 'make label DATASET=mychair [PORT=…]   draw masks in a browser: boxes, clicks, brush (docs/dataset.md)'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
-	@echo 'make logs DATASET=… STAGE=…           time, peak memory, versions and warnings of results'
-	@echo 'make graph                           the stages and their inputs'
-	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
-	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
-	@echo 'make pack DATASET=… OUT=x.zip         a result as one file that travels: report, exports, meshes, lights, frames and units'
+	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning, as the source states them'
 	@echo 'make verify [DATASET=…]              read every stored result and list damaged ones; the next run that needs one makes it again'
 	@echo 'make clean [DATASET=…]               remove the results of a dataset, or of all; those of studies: rm -r build/studies'
-	@echo 'make gc                              list results that no dataset uses, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, types, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
 	@echo 'make docs                            docs/ and the library as a site, to build/docs/index.html'
@@ -105,9 +100,8 @@ help-all:
 	@echo 'make data                            make data/ again'
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
-	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX, OpenUSD'
+	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX'
 	@echo '     EXTRAS=masks                     and the network of automatic masks (docs/photos.md)'
-	@echo '     EXTRAS=video                     and PyAV: animations as MP4, too (docs/recipes.md)'
 	@echo '     EXTRAS=dask                      and Dask: SET="executor=tcp://…" runs steps on a cluster (docs/distributed.md)'
 
 .DEFAULT:

@@ -1,4 +1,4 @@
-"""The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`.
+"""The command line: `python -m factorlib all|<stage>|plan|why|status|validate|verify|clean --dataset eames`.
 
 `argparse` reads it, because a run with nothing to do must not wait for a heavier library.  An option that is not given
 has the value of an environment variable, by which make passes NAME=value on without a shell.
@@ -25,20 +25,12 @@ from factorlib.runner.display import printable, printable_streams
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.wholefile import disk_error
 
-SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
-
 
 def project() -> Project:
-    """Return the project: the checkout of FACTORLIB_ROOT, of this package, or of the current folder.
-
-    Without a checkout, it is the current folder with the pipeline that pip installed with the package.
-    """
+    """Return the project: the checkout of FACTORLIB_ROOT, of this package, or of the current folder."""
     cwd = Path.cwd()
     checkout = next((folder for folder in (LIBRARY, cwd, *cwd.parents) if (folder / PIPELINE).is_file()), None)
     if not (root := os.environ.get("FACTORLIB_ROOT") or checkout):
-        for shipped in (folder / SHIPPED for folder in (LIBRARY, *LIBRARY.parents)):
-            if (shipped / PIPELINE).is_file():
-                return Project(cwd, photo_sets(), shipped=shipped)
         cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<folder with {PIPELINE}, stages and data>"
         raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=cwd, cure=cure)
     return Project(Path(root).resolve(), photo_sets())
@@ -64,12 +56,6 @@ def switched_on(key: str, option: bool) -> bool:
     return option or word == "1"
 
 
-def confirm(force: bool) -> bool:
-    """Return True if the listed files may be deleted; on a terminal the user is asked, unless FORCE=1 or --force."""
-    asks = not switched_on("FORCE", force) and sys.stdin.isatty()
-    return not asks or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
-
-
 def _path(word: str) -> Path:
     return Path(word).expanduser()
 
@@ -83,7 +69,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "X.Y=Z",
         "help": "set a parameter, as stage.parameter=value",
     },
-    "--force": {"key": "FORCE", "action": "store_true", "help": "run again, or delete without asking"},
+    "--force": {"key": "FORCE", "action": "store_true", "help": "run again"},
     "--strict": {"key": "STRICT", "action": "store_true", "help": 'return 3 if the verdict is "do not trust"'},
     "--recipe": {"key": "RECIPE", "action": "append", "help": "recipe: a path, a name in recipes/, or all"},
     "--held-out": {
@@ -102,11 +88,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "help": "take the thing for one material, whatever its colours",
     },
     "--port": {"key": "PORT", "type": int, "help": "port on 127.0.0.1, otherwise a free one"},
-    "--out": {"key": "OUT", "type": _path, "help": "zip file to write, otherwise <dataset>.zip in this folder"},
     "--sheet": {"key": "SHEET", "action": "store_true", "help": "also draw photos, labels and meshes"},
     "stages": {"key": "STAGE", "nargs": "*", "help": "stages; otherwise all"},
-    "first": {"key": "A", "type": _path, "nargs": "?", "help": "folder of a result, such as build/eames"},
-    "second": {"key": "B", "type": _path, "nargs": "?", "help": "folder of another result"},
     "name": {},
 }
 
@@ -149,10 +132,6 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
     "status": ("stages --dataset --set --recipe --held-out",
                lambda a: verbs.show_status(project(), request(a, a.stages)),
                "Print the progress of each stage, and the warnings of current results."),
-    "graph": ("--dataset", lambda a: verbs.show_graph(project()), "Print the stages and their inputs."),
-    "logs": ("stages --dataset --set --recipe --held-out",
-             lambda a: verbs.show_logs(project(), request(a, a.stages)),
-             "Print time, memory and package versions of current results."),
     "params": ("stages", lambda a: verbs.show_params(project(), a.stages),
                "List the parameters of stages with default, range and meaning (make params STAGE=…)."),
     "new": ("--dataset --photos --masks --meshes",
@@ -164,19 +143,13 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
                "Create data/<name> from photographs alone: automatic masks, cameras, a visual hull."),
     "label": ("--dataset --port", lambda a: verbs.label_masks(project(), dataset_of(a), a.port or 0),
               "Draw masks on a page in the browser, served on this machine alone until Ctrl-C."),
-    "compare": ("first second", lambda a: verbs.compare(project(), a.first, a.second),
-                "Write a page that compares two results: parameters, numbers, materials, lights."),
     "validate": ("--dataset --set --held-out --sheet",
                  lambda a: verbs.validate(project(), dataset_of(a), a.set, a.sheet, a.held_out),
                  "Check pipeline.yaml, settings and dataset without running anything."),
-    "pack": ("--dataset --out --force", lambda a: verbs.pack(project(), dataset_of(a), a.out, a.force),
-             "Pack a result into one zip file that does not need its dataset."),
     "verify": ("--dataset", lambda a: results_folder.verify(project(), a.dataset),
                "Read every stored result of a dataset, or of all, and list damaged ones."),
     "clean": ("--dataset", lambda a: results_folder.clean(project(), a.dataset),
               "Remove the results of a dataset; of all datasets if neither --dataset nor DATASET is given."),
-    "gc": ("--force", lambda a: results_folder.collect(project(), lambda: confirm(a.force)),
-           "List stored results that no dataset uses, and delete them after asking."),
 }  # fmt: skip
 
 

@@ -6,8 +6,7 @@ masks with labelmap.txt.  A `kitchen.png` without labels, or the alpha of a phot
 Beside a mask with labels, `kitchen_chair1.png` is the silhouette of an object.  Materials are the names in those, or
 label_1, label_2, … for labels.
 
-The labels of a mesh's parts are found by comparing the mesh with the masks under every pairing.  The draft states the
-margin of the best one.  Values that no file determines, and uncertain pairings, are left as `?`, which `make validate`
+A part that is called as a material has it.  Values that no file determines are left as `?`, which `make validate`
 rejects, and listed.  Names that must change are listed too.
 """
 
@@ -15,7 +14,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -23,11 +22,7 @@ from typing import Any
 from unicodedata import normalize
 
 import msgspec
-import numpy as np
 
-from factorlib.align.coarse import HIDDEN, match_parts
-from factorlib.align.silhouette import UNKNOWN as HIDES
-from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MASK_IMAGES, MASKS, MESHES, RESERVED_PHOTOS
 from factorlib.dataset.paths import plain_path
 from factorlib.dataset.read_dataset import UNKNOWN
@@ -35,16 +30,14 @@ from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME
 from factorlib.errors import InputError
 from factorlib.images.photo import open_photo
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
-from factorlib.labels.label_image import read_labels
 from factorlib.labels.mask_files import (
     BACKGROUND,
     LabelmeCoco,
     read_annotations,
-    read_inside,
     read_labelmap,
     read_labels_in,
 )
-from factorlib.meshes.read_mesh import read_mesh, read_parts
+from factorlib.meshes.read_mesh import read_parts
 from factorlib.onboarding.matte import opaque_pixels
 from factorlib.onboarding.photo_folder import SUFFIXES, UNREAD, Cameras, left_out, read_photo_folder, stem_of_mask
 from factorlib.wholefile import disk_error, write_text
@@ -53,16 +46,9 @@ from factorlib.yamlfile import yaml_text
 REMARK = """\
 # What the files say; `?` is for you to write.  Every key: docs/dataset.md
 # materials: label k of a mask is the k-th, from 1;  parts: part of a mesh -> material
-# margin: how many more pixels any other pairing of parts and labels would have wrong in all photos, \
-in parts of a mask's
 # objects: of each the mesh; another material for a part by `materials: {part: material}`
 """
-# Least margin of a certain pairing, in wrong pixels over the mask's.  Data sets with truth have 0.7 and more.
-MARGIN = 0.1
-MOST_OBJECTS = 200  # objects of one mesh that are examined, at 0.3 s each
 LABELMAP = "labelmap.txt"  # names of the colours in CVAT's masks
-SIDE = 400  # longest side of a silhouette for pairing, pixels
-BESIDE = "\x1f"  # separates a value from the comment beside it
 HULL = "thing"  # name of the mesh if none is given
 NO_MESH = (
     "there is no mesh: `hull: true` and `cameras: {sfm: true}` are written, which need photos that overlap, "
@@ -148,7 +134,12 @@ def new_dataset(
     sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
     sources["cameras"] = cameras.folder, cameras.files
     places = {name: (folder, files) for name, (folder, files) in sources.items() if folder}
-    _match(spec, labelled, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
+    missing += [
+        f"mesh {name}: write which material {part} is made of"
+        for name, entry in entries.items()
+        for part, material in entry.get("parts", {}).items()
+        if material == UNKNOWN
+    ]
     _write(target, spec, places, above)
     return missing
 
@@ -234,7 +225,6 @@ def _photo_entries(
 
 def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[Path]]], above: Path) -> None:
     """Write the dataset.yaml and copies of the files into the folder `target`, which is there when all of it is."""
-    text = re.sub(r'"([\w-]+|\?)\\x1F([^"]*)"', lambda m: f"{yaml_text(m[1]).split()[0]}  # {m[2]}", yaml_text(spec))
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
@@ -244,7 +234,7 @@ def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[P
                     place = draft / name / path.relative_to(source)
                     place.parent.mkdir(parents=True, exist_ok=True)
                     shutil.copyfile(path, place)
-            write_text(draft / "dataset.yaml", REMARK + text)
+            write_text(draft / "dataset.yaml", REMARK + yaml_text(spec))
             draft.rename(target)
     except OSError as error:
         raise disk_error(error, target.parent) or InputError(
@@ -416,63 +406,6 @@ def _meshes(folder: Path, files: list[Path], materials: list[str]) -> dict[str, 
         entries[name] = {"file": f"meshes/{path.relative_to(folder)}"}
         entries[name] |= {"material": materials[0]} if len(materials) == 1 else {"parts": parts}
     return entries
-
-
-def _match(spec: dict, labelled: Masks, file: Callable[[str], Path], missing: list[str]) -> None:
-    """Write the material of each open part as the masks suggest it, in the mesh or, if it differs, in an object.
-
-    `file` returns the present path of a file that is to be copied.
-    """
-    materials = spec["materials"]
-    for name, entry in spec["meshes"].items():
-        part_materials = entry.get("parts", {})
-        objects: list[tuple[str, dict, Silhouette]] = []
-        known = []
-        if UNKNOWN not in part_materials.values():
-            continue
-        for photo, obj in [(p, obj) for p in spec["photos"] for obj in p["objects"] if obj["mesh"] == name]:
-            is_separate = "mask" in obj or len(photo["objects"]) == 1
-            if is_separate and photo["name"] in labelled.by_photo and len(objects) < MOST_OBJECTS:
-                with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
-                    objects.append((photo["name"], obj, _silhouette(photo, obj, materials, file)))
-        mesh = read_mesh(file(entry["file"]), list(part_materials), {part: part for part in part_materials})
-        matches = match_parts(mesh, len(part_materials), [silhouette for _, _, silhouette in objects])
-        for k, part in [(k, part) for k, part in enumerate(part_materials) if part_materials[part] == UNKNOWN]:
-            ranked = [paired.labels[k] if paired else [] for paired in matches]
-            margins = [paired.margins[k] if paired else 0.0 for paired in matches]
-            sure = [margin >= MARGIN and each[0] != HIDDEN for margin, each in zip(margins, ranked)]
-            likely = [" or ".join(materials[label - 1] for label in each if label != HIDDEN) for each in ranked]
-            if not any(sure):
-                first = max(likely, key=len, default="")
-                part_materials[part] = f"{UNKNOWN}{BESIDE}{first}" if first else UNKNOWN
-                missing.append(f"mesh {name}: write which material {part} is made of" + f" ({first})" * bool(first))
-                continue
-            usual = Counter(each[0] for each, yes in zip(ranked, sure) if yes).most_common(1)[0][0]
-            least = min(margin for margin, yes in zip(margins, sure) if yes)
-            known.append(part)
-            part_materials[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
-            for (photo, obj, _), each, yes, words in zip(objects, ranked, sure, likely):
-                if yes and each[0] != usual:
-                    obj.setdefault("materials", {})[part] = materials[each[0] - 1]
-                elif not yes and HIDDEN not in each[:2]:  # not if the part may be hidden
-                    obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'unknown from the mask'}"
-                    missing.append(f"photo {photo}: write which material {part} of {obj['name']} is made of")
-        if known:
-            missing.append(
-                f"mesh {name}: check the materials of {', '.join(known)}, which were derived from silhouettes alone"
-            )
-
-
-def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[str], Path]) -> Silhouette:
-    """Return the labels of an object, subsampled."""
-    size = open_photo(file(photo["image"]), photo["name"]).size
-    check_pixels(size, MOST_MEGAPIXELS, file(photo["image"]), photo["name"])
-    labels = read_labels(photo["masks"], file, materials, size, photo["image"], photo["name"])
-    label = np.where(labels.left_out, HIDES, labels.label.astype(np.int16))
-    if "mask" in obj:
-        label[~read_inside(file(obj["mask"]), photo["name"], size) & (label > 0)] = HIDES
-    every = -(-max(size) // SIDE)
-    return Silhouette(label[::every, ::every])
 
 
 def _meshes_named_in(photo: str, meshes: Collection[str]) -> list[str]:

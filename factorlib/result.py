@@ -34,7 +34,6 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import data_uri, picture
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import rotate_map
-from factorlib.pack import check_whole
 from factorlib.reading import check_plain
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
@@ -51,8 +50,8 @@ from factorlib.render.photo_scene import (
 )
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
-from factorlib.results.exchange import with_exchange
 from factorlib.results.materials import SolvedMaterial
+from factorlib.results.texture_table import with_exchange
 from factorlib.stage import Inputs, silent
 from factorlib.wholefile import write_bytes
 from factorlib.yamlfile import convert
@@ -101,7 +100,9 @@ def load_result(folder: str | Path) -> Result:
             file=folder,
             cure=did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one",
         )
-    check_whole(result, STAGES)
+    if missing := [stage for stage in STAGES if not (result / stage).exists()]:
+        cure = f"make all DATASET={Path((result / MARK).read_text(encoding='utf-8', errors='replace').strip()).name}"
+        raise InputError(f"the result is incomplete: {missing[0]} is missing", file=result, cure=cure)
     stages = [stage for stage in (*STAGES, "shapes", "surface", "texture", "exchange") if (result / stage).is_dir()]
     folders = {stage: (result / stage).resolve() for stage in stages}
     file = result / "export" / "dataset.json"

@@ -121,7 +121,7 @@ CLOSED = {
     errno.EACCES: "permission denied",
     errno.EPERM: "permission denied",
 }
-ROOM = "make room there, for instance by `make gc`, which deletes unused results, and run again"
+ROOM = "make room there, for instance by `make clean`, which deletes all results"
 
 
 def disk_error(error: BaseException, folder: Path) -> InputError | None:

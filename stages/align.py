@@ -17,19 +17,15 @@ from factorlib.align.reliability import Thresholds, confidence, find_doubts, mea
 from factorlib.align.search import SearchOptions
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
 from factorlib.dataset.schema import SOURCES, ObjectsSlice
-from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.lens import radial_lens
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
-from factorlib.meshes.mesh import scale_mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, read_mesh
 from factorlib.meshes.triangle_soup import Limits
-from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectPose, PhotoPoses, pose_fields, read_poses
-from factorlib.results.shape_table import read_shapes
+from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, pose_fields, read_photo_facts, read_shapes
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
@@ -47,8 +43,6 @@ class Params(Thresholds, frozen=True, forbid_unknown_fields=True):
 
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
     """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
-    strict: bool = False
-    """Stop the run at a doubtful pose."""
     keep_doubtful: bool = False
     """Use objects with a doubtful estimated pose in the solve; otherwise they are left out."""
     limits: Limits = Limits()
@@ -64,8 +58,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         slice_ = msgspec.structs.replace(slice_, external=by_motion)
     channels = read_exr(inputs["masks"] / f"{name}.exr")
     facts = read_photo_facts(inputs["masks"] / f"{name}.json")
-    earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
-    objects = read_objects(slice_, channels, inputs, params, facts.factor, earlier)
+    objects = read_objects(slice_, channels, inputs, params, facts.factor)
     camera, known = camera_of_photo(slice_, facts, name)
     external = slice_.external.source if slice_.external else None
     sources = ["given" if entry.pose else external for entry in slice_.objects]
@@ -77,10 +70,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     object_labels = [obj.caster.mesh.labels for obj in objects]
     warn_of_materials(channels["label"], object_labels, inputs.facts["dataset.materials"], name)
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
-    if earlier:  # its focal length in pixels of this run: the two may have reduced the photo by different factors
-        focal = earlier.camera.focal_px * (earlier.camera.factor / facts.factor)
-        before = msgspec.structs.replace(earlier.camera, focal_px=focal, factor=facts.factor)
-        known = msgspec.structs.replace(known, earlier=before)
     pieces = 2 * len(objects)  # a pose and a check of it for each object
     result = align_photo(objects, camera, known, name, params.search, lambda done: progress(done, pieces, name))
     maps = rasterise([obj.caster for obj in objects], result.camera, result.poses)
@@ -89,7 +78,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         progress(len(objects) + k, pieces, f"{name}: how sure {obj.name} is")
         entries[obj.name] = object_entry(obj, k, result, maps, params, sources[k])
     for obj_name, entry in entries.items():
-        report_doubts(name, obj_name, entry, params.strict)
+        report_doubts(name, obj_name, entry)
     write_maps(out, name, channels, maps, [entry.left_out for entry in entries.values()])
     x, y = result.camera.centre
     focal = float(result.camera.focal)
@@ -117,11 +106,11 @@ def write_maps(out: Path, name: str, channels: Mapping[str, np.ndarray], maps: M
 
 
 def read_objects(
-    slice_: ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int, earlier: PhotoPoses | None
+    slice_: ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int
 ) -> list[ObjectToAlign]:
     """Read every object of the photo, with its mesh, its silhouette and its pose or keypoints, if they are known.
 
-    A pose in dataset.yaml or in its camera source takes precedence over one of an earlier run, and that over keypoints.
+    A pose in dataset.yaml or in its camera source takes precedence over keypoints.
 
     Args:
         slice_: Objects, meshes and camera of the photo.
@@ -129,7 +118,6 @@ def read_objects(
         inputs: Inputs of the stage.
         params: Parameters of the stage.
         factor: Factor by which `masks` reduced the photo.
-        earlier: Poses of an earlier run, or None.
     """
     objects = []
     materials = inputs.facts["dataset.materials"]
@@ -139,9 +127,7 @@ def read_objects(
         keypoints = None
         if fixed_pose is None and slice_.external:
             fixed_pose = slice_.external.poses.get(entry.name)
-        before = earlier.objects.get(entry.name) if earlier and fixed_pose is None else None
         file = inputs.mesh(entry.mesh, mesh_entry.file)
-        scale = before.scale if before else AS_IT_IS
         mesh = read_mesh(file, materials, mesh_entry.part_materials, entry.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, mesh.labels, entry.mask is not None)
         pose = Pose(np.array(fixed_pose.rotation), np.array(fixed_pose.translation)) if fixed_pose is not None else None
@@ -150,8 +136,7 @@ def read_objects(
             points = np.array([keypoint.point for keypoint in entry.keypoints])
             lens = radial_lens(slice_.camera, factor, *channels["label"].shape[::-1])
             keypoints = Keypoints(lens.undistort(pixels) if lens else pixels, points)
-        caster = Caster(scale_mesh(mesh, scale))
-        objects.append(ObjectToAlign(entry.name, caster, silhouette, pose, keypoints, before, scale))
+        objects.append(ObjectToAlign(entry.name, Caster(mesh), silhouette, pose, keypoints))
     return objects
 
 
@@ -178,7 +163,6 @@ def object_entry(
     reasons = find_doubts(iou, agreement, measures, estimate, params)
     return ObjectPose(
         **pose_fields(result.poses[k]),
-        scale=obj.scale,
         silhouette_iou=iou,
         label_agreement=agreement,
         source=estimate.source if estimate else source,
@@ -186,22 +170,15 @@ def object_entry(
         runner_up=estimate.runner_up if estimate else None,
         contour_error=measures.contour_error,
         normal_stderr_deg=measures.normal_stderr_deg,
-        mirrored_score=measures.mirrored_score,
         doubts=reasons,
         left_out=bool(reasons) and estimate is not None and not params.keep_doubtful,
     )
 
 
-def report_doubts(photo: str, name: str, entry: ObjectPose, strict: bool) -> None:
-    """Warn of each doubt about a pose.
-
-    Raises:
-        InputError: With `strict`, for the first doubt.
-    """
+def report_doubts(photo: str, name: str, entry: ObjectPose) -> None:
+    """Warn of each doubt about a pose."""
     cure = EXTERNAL_CURE if entry.source in (*SOURCES, "sfm") else CURE
     for reason in entry.doubts:
-        if strict:
-            raise InputError(reason, file="dataset.yaml", key=f"{photo}.{name}", cure=cure)
         log.warning("%s: %s: %s; %s", photo, name, reason, cure)
     if entry.left_out:
         log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, name)

@@ -10,7 +10,7 @@ with its choices of the model.  Textures and surface detail stay those of the ot
 If no texture is kept, or the exchange is not, the solve continues without paint.
 
 Writes exchange.json.  If the solve continued, the folders `solve`, `shading` and, with paint, `texture` are new results
-of these stages, which replace theirs (`factorlib.results.exchange`).
+of these stages, which replace theirs (`factorlib.results.texture_table`).
 """
 
 import logging
@@ -30,10 +30,15 @@ import stages.texture
 from factorlib.dataset.schema import LightSlice, with_all_rejoined
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
-from factorlib.results.exchange import FILE, REPLACED, Exchange
-from factorlib.results.surface_table import BEGINNING
-from factorlib.results.surface_table import FILE as SURFACE
-from factorlib.results.texture_table import TextureTable, read_table
+from factorlib.results.texture_table import (
+    BEGINNING,
+    EXCHANGE_FILE,
+    REPLACED,
+    SURFACE_FILE,
+    Exchange,
+    TextureTable,
+    read_table,
+)
 from factorlib.stage import Inputs, Progress, silent
 from factorlib.urm.extract import read_geometry
 
@@ -59,7 +64,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     decision = Exchange(False)
     if params.solve.solver == "paper":  # its materials are uniform, and it continues no solution
-        write_json(out / FILE, decision)
+        write_json(out / EXCHANGE_FILE, decision)
         return
     if before.longest:
         with held_back() as warnings:
@@ -73,7 +78,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
                 shutil.rmtree(out / name)
     if not decision.kept and any(light.rejoins for light in lights.values()):
         solve_again(params, inputs, out, progress)
-    write_json(out / FILE, decision)
+    write_json(out / EXCHANGE_FILE, decision)
 
 
 @contextmanager
@@ -131,7 +136,7 @@ def paint_surface(inputs: Inputs, folder: Path, photos: list[str]) -> Path:
     """Write a result of `surface` into a folder, with the textures as its detail; return the folder."""
     surface = inputs.folders.get("surface")
     (folder / "photos").mkdir()
-    for file in (SURFACE, BEGINNING):
+    for file in (SURFACE_FILE, BEGINNING):
         if surface is not None and (surface / file).is_file():
             shutil.copy(surface / file, folder / file)
     for name in photos:

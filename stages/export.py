@@ -5,10 +5,9 @@ Writes, in the gauge that Mitsuba needs:
 illumination/<light>.exr, .hdr   Environment maps; a light with suns also gets <light>_sky.exr and <light>_suns.gltf.
 coverage/<light>.exr             Standard error of radiance over its mean, in the same layout.
 materials.json, lobes.parquet, exposures.json, lights.json
-scenes/<photo>.xml               Mitsuba scenes, with meshes and lights; the same scenes for Blender and as OpenUSD.
+scenes/<photo>.xml               Mitsuba scenes, with meshes and lights; the same scenes for Blender.
 scenes/meshes/<mesh>.png         Diffuse reflectance of a painted mesh as an image.
 materials.mtlx, <mesh>.glb, meshes/<mesh>.ply
-losses.json                      Properties that each format cannot express.
 dataset.json, source/            Facts and meshes of the dataset, for new pictures of the result.
 """
 
@@ -37,8 +36,6 @@ from factorlib.export.gltf_writer import variant_name, write_glb, write_suns
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge, write_scene
-from factorlib.export.other_renderers import differences
-from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.inference.aligned_photo import read_aligned_photos
 from factorlib.jsonfile import write_json
@@ -46,11 +43,10 @@ from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG
-from factorlib.results.exchange import with_exchange
 from factorlib.results.lobe_table import read_lobes, write_lobes
-from factorlib.results.materials import MaterialTable, Reflectance, Vec3, read_exposures, read_materials, reflectances
+from factorlib.results.materials import MaterialTable, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
-from factorlib.results.texture_table import read_table
+from factorlib.results.texture_table import read_table, with_exchange
 from factorlib.stage import Inputs, Progress
 from factorlib.tracing.scene import mitsuba_map
 from factorlib.wholefile import write_bytes, write_text
@@ -88,7 +84,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     files.solved = materials = reflectances(table)
     write_json(out / "materials.json", _with_textures(table, inputs.folders.get("texture")))
     write_json(out / "exposures.json", exposures)
-    _write_tables(out, materials, solved)
+    _write_tables(out, solved)
     _write_dataset(out, inputs)
     for name, lobes in solved.items():
         progress(next(counter), total, f"light of {name}")
@@ -155,10 +151,9 @@ def _with_textures(table: MaterialTable, texture: Path | None) -> MaterialTable:
     return msgspec.structs.replace(table, materials=solved)
 
 
-def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mapping[str, Lobes]) -> None:
-    """Write the tables of lobes and suns, materials for other programs, and what these show of them."""
+def _write_tables(out: Path, lights: Mapping[str, Lobes]) -> None:
+    """Write the tables of lobes and suns."""
     write_lobes(out / "lobes.parquet", lights)
-    write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
     suns = {name: [sun.to_dict() for sun in extract_suns(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
         raise InputError(
@@ -170,9 +165,7 @@ def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mappi
 
 
 def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, params: Params) -> None:
-    """Write a photo's scene for OpenUSD, Blender and Mitsuba.
-
-    OpenUSD's has the suns in its map, the others have them beside it.
+    """Write a photo's scene for Blender and Mitsuba, with the suns beside the map.
 
     Args:
         folder: Folder of the scenes.
@@ -181,7 +174,6 @@ def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, 
         lobes: The light, without the photo's exposure.
         params: Parameters of the stage.
     """
-    write_usd_scene(folder / f"{photo}{SUFFIX}", scene)
     light = scene.light
     exposure = light.exposure
     suns = extract_suns(lobes.scale(exposure), YUP_FROM_CAMERA @ light.camera_from_light)

@@ -4,9 +4,8 @@ Writes <photo>.exr and <photo>.json.
 """
 
 import logging
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -14,15 +13,14 @@ import numpy as np
 from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.camera_files import is_raw
-from factorlib.images.colours import count_colours
+from factorlib.images.exif import reported_processing
 from factorlib.images.exr import write_exr
 from factorlib.images.lens import Undistortion, radial_lens
 from factorlib.images.photo import Photo, box_majority, check_bright, decode_photo, least_factor, open_photo
-from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
-from factorlib.labels.label_image import Labels, read_labels, read_object_indices
-from factorlib.results.photos import PhotoFacts
+from factorlib.labels.label_image import Labels, count_colours, read_labels, read_object_indices
+from factorlib.results.poses import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 
 log = logging.getLogger("factorlib.masks")
@@ -78,7 +76,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     photo = decode_photo(opened, facts.encoding, factor, path)
     photo, labels, objects = undistort_photo(photo, labels, objects, facts, f"{entry}.camera.distortion")
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
-    warn_of_processing(opened.exif, photo, labels, path)
+    if (processing := reported_processing(opened.exif)) and not is_raw(path):
+        log.warning("%s: the camera processed it (%s): %s", path, processing, CURE)
     for number, material in enumerate(materials, 1):
         if count_colours(photo.radiance[valid & (labels.label == number) & ~photo.clipped.any(axis=-1)]) > 1:
             log.warning("%s: the mask of '%s' holds several colours: %s", path, material, SPLIT)
@@ -151,18 +150,6 @@ def reduce_labels(labels: Labels, factor: int, path: Path, key: str) -> Labels:
             cure='allow more pixels, SET="masks.frame=…", or give a mask of whole objects',
         )
     return Labels(label, left_out)
-
-
-def warn_of_processing(exif: Mapping[str, Any], photo: Photo, labels: Labels, path: Path) -> None:
-    """Warn of processing that no tone curve undoes, from EXIF and from halos at the masks' contours."""
-    if (processing := reported_processing(exif)) and not is_raw(path):
-        log.warning("%s: the camera processed it (%s): %s", path, processing, CURE)
-    if (overshoot := halo(photo.radiance, labels.label > 0, ~labels.left_out)) > HALO:
-        fault = (
-            "beside contours the background overshoots by %.0f %% of the step across them, "
-            "as after sharpening or local tone mapping"
-        )
-        log.warning("%s: " + fault + ": %s", path, 100 * overshoot, CURE)
 
 
 def valid_pixels(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:

@@ -18,14 +18,12 @@ from factorlib.dataset.schema import GroundSlice, ObjectsSlice
 from factorlib.geometry.ground import Plane, resting_plane
 from factorlib.geometry.occlusion import Occluders
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
-from factorlib.meshes.mesh import Mesh, scale_mesh
+from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
-from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import ObjectPose, read_photo_poses
+from factorlib.results.poses import ObjectPose, read_photo_facts, read_photo_poses
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.background import surrounding_radiance
 from factorlib.urm.cast_shadows import GroundView, ground_observations
-from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre
+from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre, surrounding_radiance
 from factorlib.urm.observations import write_observations
 from factorlib.urm.reduction import merge, sample
 
@@ -68,7 +66,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     poses = read_photo_poses(inputs["align"] / f"{name}.json")
     height, width = photo["label"].shape
     camera = poses.camera.camera(width, height)
-    meshes = read_meshes(inputs, poses.objects)
+    meshes = read_meshes(inputs)
     ground = ground_plane(inputs, meshes, poses.objects)
     background = surrounding_radiance(photo, camera, surface_centre(geometry), ground)
     (out / "background").mkdir(exist_ok=True)  # one folder for all photos, outside the runner
@@ -95,12 +93,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_observations(out / f"{name}.parquet", merge(observations, params.merge_degrees))
 
 
-def read_meshes(inputs: Inputs, poses: dict[str, ObjectPose]) -> dict[str, Mesh]:
-    """Read the meshes of the photo's objects, by object, scaled as `align` estimated."""
+def read_meshes(inputs: Inputs) -> dict[str, Mesh]:
+    """Read the meshes of the photo's objects, by object."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
-    meshes = {obj.name: read.mesh(obj.mesh, slice_.meshes[obj.mesh], obj.materials) for obj in slice_.objects}
-    return {name: scale_mesh(mesh, poses[name].scale) for name, mesh in meshes.items()}
+    return {obj.name: read.mesh(obj.mesh, slice_.meshes[obj.mesh], obj.materials) for obj in slice_.objects}
 
 
 def ground_plane(inputs: Inputs, meshes: dict[str, Mesh], poses: dict[str, ObjectPose]) -> Plane | None:

@@ -49,7 +49,6 @@ from factorlib.render.photo_scene import DistantLight, LightMap, PlacedMesh
 from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
-from factorlib.results.poses import AS_IT_IS
 from factorlib.stage import Inputs
 from factorlib.wholefile import write_bytes, write_text
 from studies.measured.tools import ROOT
@@ -101,7 +100,7 @@ class TrueSet(SolvedSet):
             focal = focal_px_of_35mm(lens[photo], width, height)
             camera = replace(estimate.camera, focal_px=focal, principal_point=(width / 2, height / 2))
             objects = {
-                n: replace(estimate.objects[n], rotation=p.rotation, translation=p.translation, scale=AS_IT_IS)
+                n: replace(estimate.objects[n], rotation=p.rotation, translation=p.translation)
                 for n, p in self.truth.poses[photo].items()
             }
             self.poses[photo] = replace(estimate, camera=camera, objects=objects)

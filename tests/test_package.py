@@ -2,7 +2,6 @@
 
 import ast
 import os
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -26,7 +25,6 @@ EXTRAS = {  # of modules that import what an extra alone installs
     ROOT / "factorlib" / f"{module}.py": extra
     for module, extra in (
         ("runner/worker", "dask"),
-        ("images/film", "video"),
         ("onboarding/matte", "masks"),
     )
 }
@@ -68,15 +66,6 @@ def installed(tmp_path_factory):
     return folder / "site"
 
 
-RECORDS = """
-import json
-from factorlib.__main__ import project
-from factorlib.runner.dataset_state import Request, read_state
-records = read_state(project(), Request("data/moved")).records
-print(*(f"{step} {json.dumps(record, sort_keys=True, default=str)}" for step, record in records.items()), sep="\\n")
-"""
-
-
 def run(site, *words, cwd):
     environment = {**os.environ, "PYTHONPATH": str(site), "FACTORLIB_ROOT": ""}
     return subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
@@ -88,19 +77,6 @@ def test_an_installed_wheel_has_its_operator(installed, tmp_path):
     assert process.returncode == 0 and process.stdout.startswith(str(installed)), process.stderr
 
 
-def test_an_installed_command_away_from_a_checkout_has_the_same_pipeline_and_the_same_keys(installed, tmp_path):
-    """What a result is known by does not depend on where the stages lie: the records of a plan are those of the checkout."""
-    shutil.copytree(ROOT / "data" / "synthetic", tmp_path / "data" / "moved")
-    command = str(installed / "bin" / "factorlib")
-    process = run(installed, command, "validate", "-d", "moved", cwd=tmp_path)
-    assert process.returncode == 0 and "are good" in process.stdout, process.stderr
-    process = run(installed, command, "plan", "-d", "moved", "--recipe", "insert", cwd=tmp_path)
-    assert process.returncode == 0 and "recipes" in process.stdout, process.stderr
-    assert (tmp_path / "build").is_dir() and not (installed / "build").exists()
-    here, there = (run(site, "-c", RECORDS, cwd=tmp_path) for site in (installed, ROOT))
-    assert here.stdout == there.stdout != "", here.stderr + there.stderr
-
-
 def test_an_installed_command_in_a_checkout_takes_its_pipeline(installed):
-    process = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=ROOT / "data")
+    process = run(installed, str(installed / "bin" / "factorlib"), "params", cwd=ROOT / "data")
     assert process.returncode == 0 and "solve" in process.stdout

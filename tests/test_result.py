@@ -14,7 +14,6 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
-from factorlib.pack import write_pack
 from factorlib.recipe import kinds
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import silent
@@ -95,45 +94,9 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
 
 @pytest.fixture
 def copy(folder, tmp_path):
-    """Of the checkout; cp -rL of the result lies beside build/."""
+    """Of the checkout."""
     shutil.copytree(folder.parent.parent, tmp_path / "root")
-    shutil.copytree(tmp_path / "root" / "build" / "set", tmp_path / "root" / "before")
     return tmp_path / "root"
-
-
-def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(copy, result, tmp_path):
-    home, files = copy / "build" / "set", [tmp_path / f"{k}.zip" for k in range(2)]
-    refusal("report is missing", write_pack, home, files[0])
-    (home / "report").mkdir()
-    (home / "report" / "index.html").write_text("<html>")
-    shutil.move(home / "export", copy / "kept")
-    (home / "export").symlink_to(copy / "kept")  # as the runner leaves them
-    (home / "recipes").mkdir(exist_ok=True)
-    (copy / "drawn").mkdir()
-    (copy / "drawn" / "front.png").write_text("a picture")
-    (home / "recipes" / "mine").symlink_to(copy / "drawn")
-    counts = [write_pack(home, file) for file in files]
-    assert files[0].read_bytes() == files[1].read_bytes() and counts[0] == counts[1] > 10
-    shutil.unpack_archive(files[0], tmp_path / "far")
-    shutil.rmtree(copy)
-    assert factorlib.load_result(tmp_path / "far" / "set").materials["red"] == result.materials["red"]
-    assert (tmp_path / "far" / "set" / "READ_ME.txt").exists()
-    assert (tmp_path / "far" / "set" / "report" / "index.html").exists()
-    assert (tmp_path / "far" / "set" / "recipes" / "mine" / "front.png").read_text() == "a picture"
-
-
-def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_path, monkeypatch):
-    home, file = copy / "build" / "set", tmp_path / "a.zip"
-    (home / "report").mkdir()
-    for name, words in (("a.tar", "does not end in .zip"), ("none/a.zip", "does not exist")):
-        refusal(words, write_pack, home, tmp_path / name)
-    write_pack(home, file)
-    before = file.read_bytes()
-    refusal("FORCE=1", write_pack, home, file)
-    monkeypatch.setattr("zipfile.ZipFile.writestr", lambda *_: (_ for _ in ()).throw(OSError("full")))
-    with pytest.raises(OSError, match="full"):
-        write_pack(home, file, replace=True)
-    assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir() if "zip" in path.name] == ["a.zip"]
 
 
 @pytest.mark.parametrize("path, text, words", [

@@ -60,7 +60,7 @@ def called(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("extras, expected", [
-    ("blender, interchange", [["--no-deps", "bpy"], ["--no-deps", "MaterialX", "usd-core"]]),
+    ("blender, interchange", [["--no-deps", "bpy"], ["--no-deps", "MaterialX"]]),
     ("dask blender", [["-c", "dask", "distributed"], ["--no-deps", "bpy"]]),
 ])  # fmt: skip
 def test_extras_are_installed_alone_or_move_nothing_of_the_lock(called, monkeypatch, extras, expected):

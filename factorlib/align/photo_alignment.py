@@ -15,7 +15,6 @@ from factorlib.align.silhouette import ObjectView, Silhouette, labelled_iou, mak
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.results.poses import AS_IT_IS, CameraEntry, ObjectPose
 
 RELIABLE_SCORE = 0.9  # least score of a pose that can judge EXIF's focal length
 CLEARLY_BETTER = 0.01  # lead in score that another focal length needs over EXIF's
@@ -30,12 +29,10 @@ class KnownFocal(msgspec.Struct, frozen=True):
     """Prior knowledge of the focal length in photo pixels; None where nothing is known.
 
     source    dataset | colmap | transforms | bop | exif
-    earlier   camera of an earlier result, in pixels of this photo; it takes precedence
     """
 
     focal: float | None = None
     source: str | None = None
-    earlier: CameraEntry | None = None
 
 
 class Keypoints(msgspec.Struct, frozen=True):
@@ -50,14 +47,12 @@ class Keypoints(msgspec.Struct, frozen=True):
 
 
 class ObjectToAlign(msgspec.Struct, frozen=True):
-    """Object to align: its mesh, its mask, and its pose as far as the user or an earlier result gives it.
+    """Object to align: its mesh, its mask, and its pose as far as the user gives it.
 
     caster      mesh for ray casting
     silhouette  mask of the object
     pose        given pose
     keypoints   given correspondences, from which the search begins
-    earlier     pose of an earlier result, which is refined
-    scale       factors on the axes of the mesh
     """
 
     name: str
@@ -65,8 +60,6 @@ class ObjectToAlign(msgspec.Struct, frozen=True):
     silhouette: Silhouette
     pose: Pose | None = None
     keypoints: Keypoints | None = None
-    earlier: ObjectPose | None = None
-    scale: tuple[float, float, float] = AS_IT_IS  # factors of the caster's mesh against the file's
 
 
 class Focal(msgspec.Struct, frozen=True):
@@ -138,11 +131,8 @@ def align_photo(
             if focal.source == "exif":
                 estimates[k], source = _check_exif_focal(obj, view, estimates[k], photo, search)
             focal = Focal(estimates[k].state.camera(camera), 0.0, source, estimates[k].log_focal_sigma)
-    # given and earlier poses are kept to the last digit
-    poses = [
-        obj.pose or (obj.earlier.pose if obj.earlier else estimates[k].state.pose(obj.caster))
-        for k, obj in enumerate(objects)
-    ]
+    # given poses are kept to the last digit
+    poses = [obj.pose or estimates[k].state.pose(obj.caster) for k, obj in enumerate(objects)]
     in_order = [estimates.get(k) for k in range(len(objects))]
     return PhotoAlignment(focal.camera, focal.source or "estimated", focal.stderr, poses, in_order, prior)
 
@@ -153,13 +143,10 @@ def _report_after(done: int, report: Report) -> Report:
 
 
 def _initial_focal(objects: Sequence[ObjectToAlign], known: KnownFocal, camera: Camera, sigma: float) -> Focal:
-    """Return the focal length of an earlier result, else the one that fits given poses, else the prior's.
+    """Return the focal length that fits given poses, else the prior's.
 
     `camera` and `sigma` are those of the prior.
     """
-    if (earlier := known.earlier) is not None:
-        camera = msgspec.structs.replace(camera, focal=earlier.focal_px)
-        return Focal(camera, 0.0, earlier.focal_source, earlier.focal_relative_stderr)
     if sigma > 0 and any(obj.pose is not None for obj in objects):
         return Focal(_focal_of_given_poses(objects, camera), 0.0, "estimated")
     return Focal(camera, sigma, known.source)
@@ -168,7 +155,7 @@ def _initial_focal(objects: Sequence[ObjectToAlign], known: KnownFocal, camera: 
 def _estimate_object(
     obj: ObjectToAlign, view: ObjectView, photo: str, search: SearchOptions, report: Report
 ) -> PoseEstimate:
-    """Estimate the pose of one object: from an earlier result, from keypoints, or by a search.
+    """Estimate the pose of one object: from keypoints, or by a search.
 
     Args:
         obj: The object.
@@ -190,10 +177,6 @@ def _estimate_object(
             key=photo,
             cure="remove the object from this photo, or correct its mask or its materials",
         )
-    if obj.earlier is not None:  # keep the earlier pose and its runner-up; compute the score again
-        start = pose_state(obj.earlier.pose, view.camera, obj.caster)
-        score = refine_finest(obj.caster, view, start, search, 0).score
-        return PoseEstimate(start, score, 0.0, obj.earlier.runner_up, source="refined")
     if obj.keypoints is None:
         return estimate_pose(obj.caster, view, search, report)
     return refine_near(obj.caster, view, keypoint_state(obj, obj.keypoints, view, photo), search)

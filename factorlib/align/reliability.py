@@ -6,10 +6,6 @@ contour_error      Overlap tells little of a big round object and much of a thin
 normal_stderr_deg  Angle by which the normals in the mask turn when the pose moves by its standard errors, one after
                    another; the standard errors are those of the contours' normal equations. Rotations that change
                    nothing visible, as of a sphere, cost nothing. It is large for few pixels.
-mirrored_score     From far away, a body and its mirror image have one outline, from opposite sides. So a mask that was
-                   mirrored by mistake fits well with normals that are all wrong. Its mirror image fits better, by
-                   perspective and parts. It is searched with less effort, and only where a better fit is possible.
-                   It says nothing of a body that is its own mirror image, and is left out.
 confidence         A coarse mesh does not tell how its surface bends within a face, nor a thin part how it bends within
                    a pixel. The variance of the normal then grows by the factor
 
@@ -32,10 +28,7 @@ from factorlib.align.photo_alignment import ObjectToAlign, PhotoAlignment
 from factorlib.align.refine import PoseState, interpolate, mesh_contour, normal_equations, pose_state, render
 from factorlib.align.search import (
     PoseEstimate,
-    SearchOptions,
-    estimate_pose,
     normal_difference,
-    refine_finest,
     render_maps,
 )
 from factorlib.align.silhouette import ObjectView, Silhouette, Target, make_target
@@ -43,8 +36,6 @@ from factorlib.geometry.raster import Caster, Maps
 from factorlib.images.picture import picture as sdr_picture
 
 LARGEST_MOVE = 0.5  # greatest move of one unknown (radians or log) for which the normal equations hold
-FITS_TO_A_PIXEL = 0.995  # no other pose fits clearly better than a pose of this score
-QUICK = SearchOptions(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(4, 8, 8, 6), rivals=0)
 LEAST_SCORE_LEAD = 0.001  # share of the mask's pixels: a smaller lead is noise, however little is left unexplained
 DIFFERENT_DEG = 5.0  # a runner-up is a different answer if the median angle of normals exceeds this
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -65,12 +56,11 @@ MASK = np.array([0.2, 1.0, 0.2])  # contour colour of the mask, green
 class Reliability(msgspec.Struct, frozen=True):
     """Measures of reliability; None stands for a measure that was not taken.
 
-    contour_error is a share of the mask's extent, mirrored_score a labelled IoU.
+    contour_error is a share of the mask's extent.
     """
 
     contour_error: float
     normal_stderr_deg: float | None = None
-    mirrored_score: float | None = None
 
 
 class Thresholds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -121,10 +111,6 @@ def find_doubts(
         ),
         (normal_stderr > thresholds.most_normal_stderr_deg, f"the mask tells normals to {normal_stderr:.1f}° only"),
     ]
-    if estimate and (mirrored := measures.mirrored_score) is not None:
-        scores = f"({mirrored:.3f}, {estimate.score:.3f})"
-        fault = f"the mirror image of the mask fits better {scores}: was it mirrored?"
-        doubts.append((fits_better(mirrored, estimate.score), fault))
     if estimate and (runner_up := estimate.runner_up):
         lead = max(thresholds.least_lead * (1 - runner_up.score), LEAST_SCORE_LEAD)
         fault = f"another pose, its normals {runner_up.normal_difference_deg:.0f}° away, fits as well "
@@ -155,36 +141,8 @@ def measure_reliability(obj: ObjectToAlign, alignment: PhotoAlignment, number: i
     target = make_target(view, caster.mesh.labels, resolution=200)
     if estimate is None:
         return Reliability(contour_error(caster, target, pose_state(alignment.poses[number], alignment.camera, caster)))
-    mirrored_score = None
-    if estimate.score < FITS_TO_A_PIXEL and estimate.source != "keypoints":
-        mirrored = estimate_pose(caster, view.mirror(), QUICK)
-        if not fits_better(mirrored.score, estimate.score) or not is_own_mirror_image(caster, view, mirrored):
-            mirrored_score = mirrored.score
     error = contour_error(caster, target, estimate.state)
-    return Reliability(error, normal_stderr_deg(caster, target, estimate.state), mirrored_score)
-
-
-def fits_better(mirrored_score: float, score: float) -> bool:
-    """Return True if the mirror image of a mask fits so much better that the mask may have been mirrored."""
-    return 1 - mirrored_score < (1 - score) / 2
-
-
-def is_own_mirror_image(caster: Caster, view: ObjectView, mirrored: PoseEstimate) -> bool:
-    """Return True if the mesh, mirrored about an axis, fits the mask as well as it fits the mask's mirror image.
-
-    Args:
-        caster: The mesh.
-        view: The mask and the camera.
-        mirrored: Pose that was found for the mirror image of the view.
-    """
-    vertices = caster.mesh.vertices - caster.centre
-    axes = np.concatenate([np.linalg.eigh(vertices.T @ vertices)[1].T, np.eye(3)])
-    for axis in axes:  # F R S is a rotation, where F mirrors the photo and S the mesh
-        rotation = np.diag([-1, 1, 1]) @ mirrored.state.rotation @ (np.eye(3) - 2 * np.outer(axis, axis))
-        state = msgspec.structs.replace(mirrored.state, rotation=rotation, a=-mirrored.state.a)
-        if refine_finest(caster, view, state, QUICK, QUICK.steps[-1]).score > mirrored.score - LEAST_SCORE_LEAD:
-            return True
-    return False
+    return Reliability(error, normal_stderr_deg(caster, target, estimate.state))
 
 
 def contour_error(caster: Caster, target: Target, state: PoseState) -> float:

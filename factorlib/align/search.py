@@ -61,7 +61,7 @@ class PoseEstimate(msgspec.Struct, frozen=True):
     score             labelled IoU at the finest resolution
     log_focal_sigma   standard error of the log focal length
     runner_up         best pose that is rotated by more than DISTINCT_DEG against this one
-    source            found (by search), keypoints (refined from the user's keypoints), refined (an earlier result)
+    source            found (by search) or keypoints (refined from the user's keypoints)
     """
 
     state: PoseState

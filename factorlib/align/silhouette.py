@@ -125,14 +125,6 @@ class ObjectView(msgspec.Struct, frozen=True):
         """Number of free unknowns of `PoseState.apply_step`: 7, or 6 if the focal length is known."""
         return 7 if self.focal_sigma > 0 else 6
 
-    def mirror(self) -> "ObjectView":
-        """Return the view with left and right exchanged."""
-        camera = msgspec.structs.replace(
-            self.camera, centre=(self.camera.width - self.camera.centre[0], self.camera.centre[1])
-        )
-        silhouette = Silhouette(np.ascontiguousarray(self.silhouette.label[:, ::-1]))
-        return ObjectView(silhouette, camera, self.focal_sigma)
-
 
 def with_prior_focal(camera: Camera, focal: float | None, source: str | None) -> tuple[Camera, float]:
     """Return the camera at its most probable focal length, and the prior's standard deviation of the logarithm.

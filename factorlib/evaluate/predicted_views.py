@@ -134,13 +134,13 @@ def project_points(
         Interpolated radiance, and the cosine between the directions to both cameras: −inf for points that the photo
         does not see.
     """
-    # x = Rᵀ (x_cam − t) / s: points, and unit directions to both cameras, in the object's frame
-    on_object = (points - pose.pose.translation) @ pose.pose.rotation / np.array(pose.scale)
-    centres = (-each.pose.translation @ each.pose.rotation / np.array(each.scale) for each in (pose, source_pose))
+    # x = Rᵀ (x_cam − t): points, and unit directions to both cameras, in the object's frame
+    on_object = (points - pose.pose.translation) @ pose.pose.rotation
+    centres = (-each.pose.translation @ each.pose.rotation for each in (pose, source_pose))
     to_camera, to_source = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (c - on_object for c in centres))
-    facing = np.sum(normals @ pose.pose.rotation * np.array(pose.scale) * to_source, axis=1) > 0
+    facing = np.sum(normals @ pose.pose.rotation * to_source, axis=1) > 0
     # rows and columns of the source, in units of its pixels
-    x, y, z = source_pose.pose.apply(on_object * np.array(source_pose.scale)).T
+    x, y, z = source_pose.pose.apply(on_object).T
     place = source.camera.project(np.column_stack([x, y, np.where(z > 0, z, 1.0)])).T[::-1] - 0.5
 
     def sample(values: np.ndarray, order: int = 1) -> np.ndarray:

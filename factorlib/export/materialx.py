@@ -13,7 +13,7 @@ A painted part of a mesh has two materials more, m_<material>__<mesh>, whose dif
 (sRGB, by the texture coordinates `st`) in place of the constant.
 
 MaterialX's renderers differ from the solved model.  They shadow with the height-correlated Smith term and compensate
-for the energy of multiple scattering (measured by `factorlib.export.other_renderers`).
+for the energy of multiple scattering.
 """
 
 import xml.etree.ElementTree as ET

@@ -1,4 +1,4 @@
-"""Mesh files that scenes refer to: for each part of one material PLY and OpenUSD, and an image of a painted mesh."""
+"""Mesh files that scenes refer to: a PLY for each part of one material, and an image of a painted mesh."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,6 @@ from factorlib.dataset.schema import MeshEntry, MeshInstance, ObjectsSlice
 from factorlib.export.exported_scene import ExportedShape
 from factorlib.export.mitsuba import paint_range
 from factorlib.export.texture_atlas import UNKNOWN_PIXEL, Atlas, make_atlas
-from factorlib.export.usd import SUFFIX, write_usd_mesh
 from factorlib.images.picture import write_png
 from factorlib.inference.aligned_photo import AlignedPhoto, pixel_on_mesh
 from factorlib.meshes.mesh import Mesh
@@ -17,8 +16,7 @@ from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read_mesh import MeshCache
 from factorlib.results.materials import PaintRange, Reflectance
 from factorlib.results.poses import ObjectPose
-from factorlib.results.surface_table import read_surface
-from factorlib.results.texture_table import read_textures
+from factorlib.results.texture_table import read_surface, read_textures
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import paint, rigid
 
@@ -103,7 +101,7 @@ class MeshFiles:
         """
         mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
         pose = poses[obj.name]
-        cam_from_object = rigid(np.array(pose.rotation) * pose.scale, pose.translation)
+        cam_from_object = rigid(np.array(pose.rotation), pose.translation)
         key = (obj.mesh, *sorted(obj.materials.items()))
         if key not in self._stems:
             number = 1 + sum(other[0] == obj.mesh for other in self._stems)
@@ -130,7 +128,6 @@ class MeshFiles:
             file = self.scenes / f"{stem}.{self.materials[label - 1]}"
             part = submesh(exported, label)
             write_ply(f"{file}.ply", part)
-            write_usd_mesh(f"{file}{SUFFIX}", part)
             fine = submesh(mesh, label)
             if fine.detail is not None:
                 shades = paint(self.solved[self.materials[label - 1]], fine.detail)

@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 from shutil import rmtree
 
-from rich.progress import Progress
-
 from factorlib.errors import InputError
 from factorlib.images.light_map import maps_in
 from factorlib.wholefile import disk_error, sync_tree
@@ -60,18 +58,16 @@ def _generate(options: argparse.Namespace, out: Path, fresh: Path) -> None:
         fault = "this folder is neither empty nor a data set"
         raise InputError(fault, file=out, cure="name an empty folder, or a data set to replace")
     rmtree(fresh, ignore_errors=True)
-    with Progress() as bar:
-        task = bar.add_task(f"{out}", total=1)
 
-        def report(done: float, total: float, text: str) -> None:
-            """Update the progress bar."""
-            bar.update(task, completed=done, total=total, description=text)
+    def report(done: float, total: float, text: str) -> None:
+        """Print the progress."""
+        print(f"{out}: {done / total:4.0%} {text}", file=sys.stderr)
 
-        if options.set == "eames":
-            chairs = eames.ChairSetOptions(exact=options.exact, painted=options.painted)
-            eames.generate(fresh, options.seed, maps, chairs, report)
-        else:
-            synthetic.generate(fresh, options.seed, maps, synthetic.SyntheticOptions(), report)
+    if options.set == "eames":
+        chairs = eames.ChairSetOptions(exact=options.exact, painted=options.painted)
+        eames.generate(fresh, options.seed, maps, chairs, report)
+    else:
+        synthetic.generate(fresh, options.seed, maps, synthetic.SyntheticOptions(), report)
     sync_tree(fresh)
 
 

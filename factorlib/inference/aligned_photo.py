@@ -68,8 +68,7 @@ def pixel_on_mesh(name: str, mesh: Mesh, photos: Mapping[str, AlignedPhoto]) -> 
         for number, entry in enumerate(photo.objects.objects, start=1):
             depth = photo.geometry["depth"][np.rint(photo.geometry["object"]) == number]
             if entry.mesh == name and len(depth):
-                scale = float(np.mean(photo.poses.objects[entry.name].scale))
-                sizes.append(float(np.median(depth)) / photo.poses.camera.focal_px / (scale * extent))
+                sizes.append(float(np.median(depth)) / photo.poses.camera.focal_px / extent)
     return float(np.median(sizes)) if sizes else None
 
 

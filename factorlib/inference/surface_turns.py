@@ -36,7 +36,6 @@ from factorlib.inference.fit import Hyperparameters, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.inference.likelihood import cholesky_factor, cholesky_inverse
 from factorlib.light.prior import LightPrior
-from factorlib.meshes.mesh import scale_mesh
 from factorlib.meshes.subdivision import SubdividedMesh, solve_by_gradients
 from factorlib.results.poses import ObjectPose
 from factorlib.robust import TINY
@@ -183,19 +182,17 @@ def attach_pixels(
             continue
         rows = np.flatnonzero(object_number == number)
         fine = surfaces.meshes[mesh]
-        scale = np.array(entry.scale)
-        solid = scale_mesh(fine.mesh, entry.scale)
         # first hits of the pixels' rays, their triangles and barycentric coordinates
-        hits = Caster(solid).cast_along(along[rows], entry.pose)
+        hits = Caster(fine.mesh).cast_along(along[rows], entry.pose)
         rows = rows[hits.face >= 0]
         face = hits.face[hits.face >= 0]
         uv = hits.uv[hits.face >= 0]
         node[rows] = surfaces.first_nodes[mesh] + fine.faces[face]
         share[rows] = np.column_stack([1 - uv.sum(1), uv])
         # R of (1), with its sign changed where the surface is seen from behind
-        toward = face_normals(solid, face) @ entry.pose.rotation.T
+        toward = face_normals(fine.mesh, face) @ entry.pose.rotation.T
         side = np.where(np.sum(toward * along[rows], 1) > 0, -1.0, 1.0)
-        frame[rows] = side[:, None, None] * entry.pose.rotation * (scale.mean() / scale)
+        frame[rows] = side[:, None, None] * entry.pose.rotation
     return SurfacePositions(node, share, frame)
 
 

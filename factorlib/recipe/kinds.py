@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from factorlib.dataset.schema import GivenMaterial, Number, Share, Shares, Vec2, Vec3
+from factorlib.dataset.schema import GivenMaterial, Share, Vec2
 from factorlib.errors import InputError
 from factorlib.reading import read_text, reading
 
@@ -27,7 +27,6 @@ Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
-PoseRow = tuple[Number, Number, Number, Number]
 Table = str | dict[str, GivenMaterial] | None  # a file, or materials by name
 LIGHT_FILES = (".hdr", ".exr")
 BALL = "ball"
@@ -38,33 +37,13 @@ CURE = (
 )
 
 
-class BaseRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
+class PhotoRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
     """Fields that every kind of recipe has."""
 
     samples: Samples = 32
     """Samples per pixel of the path tracer; the noise falls with their square root."""
-
-
-class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sun that replaces the recovered ones; the light as a whole keeps its energy in each channel."""
-
-    direction: Vec3
-    """Direction toward the sun, in the frame of the photo's exported light (illumination/<name>.exr, lights.json).
-    The axes are x right, y up, z toward the viewer for a light fixed to the camera.  For a light fixed to the world,
-    they are the world's axes with y and z reversed."""
-    strength: Annotated[float, msgspec.Meta(ge=0, le=1)]
-    """The sun's share of the light's energy, which is the integral of radiance over the sphere."""
-    size: Annotated[float, msgspec.Meta(ge=0.05, le=90)] = 0.53
-    """Angular diameter in degrees."""
-
-
-class PhotoRecipe(BaseRecipe, frozen=True, kw_only=True):
-    """Fields of recipes that make pictures of each photo."""
-
     photos: list[str] = []
     """Photos whose camera, objects and light are used; by default all."""
-    sun: AssumedSun | None = None
-    """An assumed sun in the light of the one photo that the recipe names."""
 
 
 class ResizedRecipe(PhotoRecipe, frozen=True, kw_only=True):
@@ -90,21 +69,8 @@ class ResynthesisRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="resynthesis
     """Recipe of a photo with its objects replaced by path-traced ones."""
 
 
-class ViewCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Camera of a view, by exactly one of photo and pose."""
-
-    photo: str | None = None
-    """Photo whose camera is used, with its focal length and size; an object that both photos show places it."""
-    pose: tuple[PoseRow, PoseRow, PoseRow] | None = None
-    """Matrix [R t] from the frame of the photo's first object to that of the camera: x_cam = R x_object + t, in
-    OpenCV's axes and the mesh's units.  Focal length and size are the photo's own."""
-
-
 class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
-    """Recipe of the objects from another view; the light stays.
-
-    The camera moves about their middle, unless `camera` places it.
-    """
+    """Recipe of the objects from another view: the camera moves about their middle, and the light stays."""
 
     azimuth: Degrees = 30.0
     """Angle about the camera's upright axis, to the right in the photo."""
@@ -112,8 +78,6 @@ class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
     """Angle upward, relative to the photo's camera."""
     zoom: Factor = 1.0
     """Magnification of the objects in the picture."""
-    camera: ViewCamera | None = None
-    """Camera that replaces the moved one, and with it azimuth, elevation and zoom."""
 
 
 class TurntableRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="turntable"):
@@ -155,16 +119,11 @@ class TransferRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="transfer"):
 
 
 class GroundFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Height of the ground, and its specular reflection; the photo shows its diffuse colour."""
+    """Height of the ground; the photo shows its colour."""
 
     drop: Annotated[float, msgspec.Meta(ge=-10, le=100)] = 0.0
     """Depth of the ground below the plane that is found or given, in heights of the object beside: the height of the
     pedestal on which that stands."""
-
-    specular: Shares = (0.0, 0.0, 0.0)
-    """k_s of a reflective ground, such as a polished floor."""
-    roughness: Share = 0.3
-    """Roughness of that reflection."""
 
 
 class InsertRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="insert"):
@@ -189,29 +148,11 @@ class InsertRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="insert"):
     up: Literal["x", "y", "z"] = "y"
     """The axis of a mesh file that points upward."""
     ground: GroundFields = GroundFields()
-    """Height and specular reflection of the ground."""
-
-
-class GridRecipe(BaseRecipe, frozen=True, kw_only=True, tag="grid"):
-    """Recipe of balls of every material (rows) in every light (columns), also of pairs that no photo shows."""
-
-    materials: list[str] = []
-    """Materials of the data set; by default all."""
-    lights: list[str] = []
-    """Photos whose light is used, or files; by default all photos."""
-    size: Pixels = 128
-    """Width of a ball's picture."""
+    """Height of the ground."""
 
 
 AnyRecipe = (
-    ResynthesisRecipe
-    | ViewRecipe
-    | TurntableRecipe
-    | MovingLightRecipe
-    | RelightRecipe
-    | TransferRecipe
-    | InsertRecipe
-    | GridRecipe
+    ResynthesisRecipe | ViewRecipe | TurntableRecipe | MovingLightRecipe | RelightRecipe | TransferRecipe | InsertRecipe
 )
 KINDS = {kind.__struct_config__.tag: kind for kind in AnyRecipe.__args__}
 

@@ -61,11 +61,9 @@ def check_recipe(
                 file=path,
                 cure=f"paths are relative to the recipe; meshes without a file are {', '.join([BALL, *meshes])}",
             )
-    if isinstance(recipe, kinds.PhotoRecipe):
-        _check_photos(recipe, photos, refuse)
-    if isinstance(recipe, kinds.RelightRecipe | kinds.GridRecipe):
-        _check_names(refuse, "lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
+    _check_photos(recipe, photos, refuse)
     if isinstance(recipe, kinds.RelightRecipe):
+        _check_names(refuse, "lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
         _check_distinct(refuse, "lights", [Path(name).stem for name in recipe.lights], "light")
         if not recipe.lights and len(lights) == 1:
             refuse(
@@ -73,15 +71,15 @@ def check_recipe(
                 f"the photos share one light, '{next(iter(lights))}', so there is no other to relight by",
                 "name light maps: `lights: [studio.hdr]`, lat-long .hdr or .exr files, relative to the recipe",
             )
-    if isinstance(recipe, kinds.TransferRecipe | kinds.GridRecipe):
-        _check_names(refuse, "materials", recipe.materials, materials, "material")
+    known = materials
     if isinstance(recipe, kinds.TransferRecipe | kinds.InsertRecipe) and recipe.table is not None:
         table = recipe.table
-        materials = [*materials, *materials_of(table, path.parent / table if isinstance(table, str) else path)]
+        known = [*materials, *materials_of(table, path.parent / table if isinstance(table, str) else path)]
     if isinstance(recipe, kinds.TransferRecipe):
-        _check_names(refuse, "materials", recipe.materials.values(), materials, "material")
+        _check_names(refuse, "materials", recipe.materials, materials, "material")
+        _check_names(refuse, "materials", recipe.materials.values(), known, "material")
     if isinstance(recipe, kinds.InsertRecipe):
-        _check_new_object(recipe, objects, meshes, materials, refuse)
+        _check_new_object(recipe, objects, meshes, known, refuse)
 
 
 def _check_names(refuse: Refusal, key: str, names: Iterable[str], known: list[str], kind: str) -> None:
@@ -96,7 +94,7 @@ def _check_distinct(refuse: Refusal, key: str, names: list[str], kind: str) -> N
 
 
 def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal) -> None:
-    """Check the photos, the size, the camera and the assumed sun of a recipe."""
+    """Check the photos and the size of a recipe."""
     _check_names(refuse, "photos", recipe.photos, photos, "photo")
     _check_distinct(refuse, "photos", recipe.photos, "photo")
     if isinstance(recipe, kinds.ResizedRecipe):
@@ -106,37 +104,6 @@ def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal)
             "cannot be combined with width",
             "keep across, which crops to the objects, or width, which shows the whole frame",
         )
-    if isinstance(recipe, kinds.ViewRecipe) and recipe.camera is not None:
-        _check_camera(recipe, recipe.camera, photos, refuse)
-    if recipe.sun is None:
-        return
-    if isinstance(recipe, kinds.RelightRecipe):
-        refuse("sun", "a recipe of kind relight takes its lights from `lights`", "remove `sun`")
-    if len(recipe.photos) != 1:
-        refuse(
-            "sun.direction",
-            f"the direction is relative to the light of one photo, and the recipe has {len(recipe.photos) or 'all'}",
-            "name one photo: `photos: [...]`",
-        )
-    if not any(recipe.sun.direction):
-        refuse("sun.direction", "the direction has no length", "give a vector other than [0, 0, 0]")
-
-
-def _check_camera(recipe: kinds.ViewRecipe, camera: kinds.ViewCamera, photos: list[str], refuse: Refusal) -> None:
-    refuse.refuse_if(
-        (camera.photo is None) == (camera.pose is None),
-        "camera",
-        "needs exactly one of photo and pose",
-        "write `camera: {photo: NAME}`, or `camera: {pose: [[r, r, r, t], [r, r, r, t], [r, r, r, t]]}`",
-    )
-    moved = [
-        name for name in ("azimuth", "elevation", "zoom") if getattr(recipe, name) != getattr(kinds.ViewRecipe(), name)
-    ]
-    refuse.refuse_if(moved, "camera", f"cannot be combined with {' and '.join(moved)}", "keep one of the two")
-    if camera.photo is not None:
-        refuse.check_known("camera.photo", camera.photo, photos, "photo")
-    if camera.pose is not None:
-        refuse.check_rotation("camera.pose", tuple(row[:3] for row in camera.pose))
 
 
 def _check_new_object(

@@ -19,7 +19,7 @@ Activation    SiLU, so that derivatives are continuous; at the end s tanh(x/s), 
               never negative, and bounded.
 Range         sharpness and roughness are clamped to the rendered range, `SHARPNESS` and `ROUGHNESS`.
 Pixels        50 of each of 4000 spheres, lobes uniform in direction, camera far away, so that every view is
-              (0, 0, −1): `factorlib.generate.lobe_spheres`; Mitsuba renders them in place of Blender.
+              (0, 0, −1): `studies.measured.lobe_spheres`; Mitsuba renders them in place of Blender.
 Training      `training.trained_plainly`: relative error, Adam.
 Frame         normals and lobes of every azimuth about the camera's axis, as in photographs. An operator receives
               scalars only, so the networks are evaluated in the frame where the view is (0, 0, −1) and the normal is

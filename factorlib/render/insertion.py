@@ -12,9 +12,7 @@ L₁ − (1 − α) s L₀, so
     composite = (1 − α) s B + max(L₁ − (1 − α) s L₀, 0)     (2)
 
 Under the object, s is that of the nearest pixel beside it.  L₀ and L₁ use the same random numbers, so s is exactly 1 if
-no path meets the object, and the pixel stays unchanged.  A reflective ground adds the change of its specular part
-alone, which is the object's reflection.  s then also scales the specular part that the photo shows.  The composite is
-therefore right only for a ground that is mostly diffuse.
+no path meets the object, and the pixel stays unchanged.
 
 The photo's own shadow is compared with the predicted one on the ground near its objects.  The measure is the
 correlation of log luminance of B with that of L₀ over these pixels.  On a plane in light from infinity, L₀ is
@@ -85,13 +83,11 @@ class GroundSurface(msgspec.Struct, frozen=True):
 
     Attributes:
         diffuse: Lambertian reflectance, None if it is unknown
-        polish: specular part of a reflective ground
         source: how the plane was decided, after "the ground is"
     """
 
     plane: Plane
     diffuse: tuple[float, float, float] | None = None
-    polish: Reflectance | None = None
     source: str = "given"
 
 
@@ -260,29 +256,22 @@ def insert_object(
     new = shapes([insertion.new], insertion.scene.materials)
     shows_ground = (insertion.distance < 1) & ~covered
     diffuse = insertion.ground.diffuse or _ground_colour(insertion, photo, shows_ground, seed)
-    polish = insertion.ground.polish
-    materials = [Reflectance(diffuse, (0.0,) * 3, 1.0), *([] if polish is None else [polish])]
-    pairs = [(disc, disc | new) for disc in map(insertion.disc, materials)]
-    previews = [[insertion.preview(entries, seed) for entries in pair] for pair in pairs]
+    disc = insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))
+    pair = disc, disc | new
+    previews = [insertion.preview(entries, seed) for entries in pair]
     window = _reach(insertion, previews)
     camera = crop_camera(insertion.scene.camera, *window)
     coverage = _coverage(insertion, camera, samples, seed)
     background = (1 - coverage)[..., None]
     fade = insertion.fade[window]
-    guides = [insertion.guides(entries, camera, seed) for entries in pairs[0]]
-    renderings = [[insertion.render(entries, camera, samples, seed) for entries in pair] for pair in pairs]
+    guides = [insertion.guides(entries, camera, seed) for entries in pair]
+    without, with_object = (insertion.render(entries, camera, samples, seed) for entries in pair)
     # (2)
-    without, with_object = renderings[0]
     shadow = _shadow(without, with_object, guides[0], coverage, fade)
     gain = denoise_picture(with_object, guides[1])[..., :3] - background * shadow * without[..., :3]
     part = background * shadow * photo[window] + np.maximum(gain, 0) * (background < 1)
-    # change of the ground's specular part: the object's reflection in it
-    for pair in renderings[1:]:
-        clean = [denoise_picture(*each)[..., :3] for each in zip(pair, guides)]
-        mirrored = (clean[1] - clean[0]) * (pair[1] != pair[0])[..., :3] * shows_ground[window][..., None]
-        part = np.maximum(part + mirrored * background * fade, 0)
     whole = photo.copy(), np.zeros(covered.shape), np.ones_like(photo)
-    result = InsertionResult(*whole, np.asarray(diffuse), previews[0][0])
+    result = InsertionResult(*whole, np.asarray(diffuse), previews[0])
     result.composite[window] = part
     result.coverage[window] = coverage
     result.shadow[window] = shadow
@@ -356,19 +345,19 @@ def _ground_colour(
     return vec3(np.clip(GREY * np.median(photo[middles][usable] / lit[usable], axis=0), DARKEST, BRIGHTEST))
 
 
-def _reach(insertion: InsertionScene, previews: Sequence[Sequence[Picture]]) -> tuple[slice, slice]:
-    """Return the rows and columns of the pixels that the new object, its shadow or its reflection can reach.
+def _reach(insertion: InsertionScene, previews: Sequence[Picture]) -> tuple[slice, slice]:
+    """Return the rows and columns of the pixels that the new object or its shadow can reach.
 
     These are the object itself, and pixels of a preview most of whose neighbours change by more than LEAST_CHANGE.
 
     Args:
         insertion: the scene and the new object's place
-        previews: pairs of previews without and with the object
+        previews: previews without and with the object
     """
     camera, middles = insertion.preview_camera
     fade = insertion.fade[middles]
-    changes = [(np.abs(second - first) * fade > LEAST_CHANGE * first).any(axis=-1) for first, second in previews]
-    changed = median_filter(np.any(changes, axis=0), 3)
+    first, second = previews
+    changed = median_filter((np.abs(second - first) * fade > LEAST_CHANGE * first).any(axis=-1), 3)
     changed[visible_window(insertion.new.vertices, camera, CAMERA_POSE)] = True
     spans = [np.flatnonzero(changed.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0)]
     pixel = middles[0].step

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
+from factorlib.export.exported_scene import ALL_BOUNCES
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.images.exr import write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
@@ -129,25 +129,6 @@ class PhotoScene(msgspec.Struct, frozen=True):
     def near_clip(self) -> float:
         """The near clipping distance of the camera."""
         return NEAR * self.size
-
-
-def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, share: float) -> Lobes:
-    """Return the light with its suns replaced by one that holds `share` of its energy.
-
-    Each channel keeps its energy.  If a channel has no energy outside its suns, all of it goes to the new sun.
-
-    Args:
-        light: the light, with or without suns
-        axis: unit direction to the sun, in the light's frame
-        diameter_deg: angular diameter of the sun, degrees
-        share: the sun's share of the energy, in [0, 1]
-    """
-    # `factor` scales the rest of the light; the sun takes the energy that is left
-    sky = light.take(~light.suns)
-    factor = np.divide((1 - share) * light.energy, sky.energy, out=np.zeros(3), where=sky.energy > 0)
-    sharpness = np.append(sky.sharpness, 4 / np.radians(diameter_deg / 2) ** 2)
-    weight = (light.energy - factor * sky.energy) / lobe_energy(sharpness[-1])
-    return Lobes(np.vstack([sky.axis, axis]), sharpness, np.vstack([factor * sky.weight, weight]))
 
 
 def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
@@ -287,27 +268,6 @@ def before_light(
     light = render_scene(light_entries(scene.light, scene.size), view, LIGHT_SAMPLES, 0, 1)
     uncovered = 1 - picture[..., 3:]
     return np.concatenate([picture[..., :3] + uncovered * light, np.ones_like(uncovered)], axis=-1)
-
-
-def lit_ball(light: DistantLight, material: Reflectance, size: int, samples: int) -> Float[np.ndarray, "h w 4"]:
-    """Render a ball that fills the picture, seen from the front.
-
-    Args:
-        light: the light
-        material: the ball's reflectance
-        size: width and height of the picture, in pixels
-        samples: samples per pixel
-
-    Returns:
-        Linear radiance times coverage, and coverage.
-    """
-    # the ball, of radius 1, touches the border of the picture
-    distance = 20.0
-    focal = size / 2 * np.sqrt(distance**2 - 1)
-    camera = Camera(size, size, focal, (size / 2, size / 2))
-    sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
-    entries = {**light_entries(light, distance), "ball": sphere}
-    return render_denoised(entries, sensor(camera, CAMERA_POSE, alpha=True), samples, 0, DIRECT)
 
 
 def resize_scene(scene: PhotoScene, width: int | None) -> PhotoScene:

@@ -1,7 +1,7 @@
 """Rendering of recipes to files: other views, other light, other materials, and inserted objects.
 
 A photo gets <photo>.png (8-bit sRGB) and <photo>.exr (linear), or one pair per light as <photo>/<light>.png and .exr.
-An animation is <photo>.gif with its frames <photo>/000.png and so on.  A grid is one grid.png. <photo>.json holds the
+An animation is <photo>.gif with its frames <photo>/000.png and so on.  <photo>.json holds the
 caption of the picture and other facts about it, if there are any.
 """
 
@@ -18,9 +18,8 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
-from factorlib.images.film import write_gif, write_mp4
-from factorlib.images.grain import add_grain
-from factorlib.images.picture import picture, write_png
+from factorlib.images.picture import picture, write_gif, write_png
+from factorlib.images.tone import srgb_decode, srgb_encode
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import without_paint
 from factorlib.recipe import kinds
@@ -34,22 +33,58 @@ from factorlib.render.photo_scene import (
     TracedPicture,
     before_light,
     crop_to_objects,
-    lit_ball,
     resize_scene,
     rotate_light,
     traced_photo,
 )
 from factorlib.render.placement import free_placement, spot_beside, standing_mesh, unproject_spot
 from factorlib.render.solved_set import SolvedSet
-from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
-from factorlib.wholefile import write_text
+
+# Film grain of a photo: the noise of its pixels, and noise like it.
+#
+# Noise is measured in sRGB-encoded values, where it depends little on brightness.  The diagonal detail of 2 × 2 pixels,
+# (a − b − c + d)/2, has the covariance of the noise over the channels and little of the picture itself.  Its scale is
+# the median absolute value over 0.6745 (Donoho and Johnstone, "Ideal spatial adaptation by wavelet shrinkage", 1994),
+# and detail of more than OUTLIER scales, at edges, does not count.
+
+OUTLIER = 3.0
+DARKEST = 0.02  # least encoded value that counts: below it, noise is cut off
+BRIGHTEST = 0.98  # largest one, over the picture's largest
+
+Picture = Float[np.ndarray, "h w 3"]
+
+
+def grain_covariance(photo: Picture) -> Float[np.ndarray, "3 3"]:
+    """Return the covariance of the noise over the channels, in sRGB-encoded values; `photo` is linear."""
+    height, width = photo.shape[0] // 2 * 2, photo.shape[1] // 2 * 2
+    encoded = srgb_encode(photo[:height, :width])
+    corners = np.stack([encoded[i::2, j::2] for i in (0, 1) for j in (0, 1)])
+    usable = ((corners > DARKEST) & (corners < BRIGHTEST * encoded.max(initial=0))).all(axis=(0, 3))
+    detail = np.einsum("k,khwc->hwc", [0.5, -0.5, -0.5, 0.5], corners)[usable]
+    if len(detail) == 0:
+        return np.zeros((3, 3))
+    scale = np.median(np.abs(detail), axis=0) / 0.6745
+    detail = detail[(np.abs(detail) <= OUTLIER * scale).all(axis=1)]
+    return detail.T @ detail / len(detail)
+
+
+def add_grain(radiance: Picture, photo: Picture, share: Float[np.ndarray, "h w"], seed: int = 1) -> Picture:
+    """Return linear radiance with the photo's grain.
+
+    Args:
+        radiance: a picture without noise, in the photo's units
+        photo: the photo
+        share: weight of the grain in each pixel; pixels of weight 0 are unchanged
+        seed: seed of the random numbers
+    """
+    size, axes = np.linalg.eigh(grain_covariance(photo))
+    noise = np.random.default_rng(seed).standard_normal(radiance.shape) * np.sqrt(size.clip(0)) @ axes.T
+    grainy = srgb_decode(srgb_encode(radiance) + share[..., None] * noise)
+    return np.where(share[..., None] > 0, np.maximum(grainy, 0), radiance)
+
 
 log = logging.getLogger("factorlib.recipes")
-SUN = (
-    "The sun is assumed, not recovered: it stands in direction {sun.direction} of the light's map, {sun.size:g}° wide, "
-    "and holds {sun.strength:.0%} of the light's energy, which is kept."
-)
 CONTRADICTED = "the ground that the photo shows is not shaded as the recovered light predicts"
 PEDESTAL = " (if the photo's objects stand above the floor, lower the ground: `ground: {drop: …}`)"
 
@@ -66,8 +101,6 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
     Raises:
         InputError: None of the recipe's photos can be rendered, or one that the recipe names cannot.
     """
-    if isinstance(recipe, kinds.GridRecipe):
-        return write_grid(recipe, results, out, progress)
     photos = recipe.photos or results.photos
     refusals = []
     for index, photo in enumerate(photos):
@@ -75,12 +108,8 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
             report = partial(_report_photo, progress, index, len(photos), photo)
             report(0)
             facts = WRITERS[type(recipe)](recipe, results, photo, out, report) or {}
-            captions = [facts.pop("caption")] if "caption" in facts else []
-            if recipe.sun is not None:
-                facts["assumed_sun"] = msgspec.to_builtins(recipe.sun)
-                captions.append(SUN.format(sun=recipe.sun))
             if facts:
-                write_json(out / f"{photo}.json", facts | ({"caption": " ".join(captions)} if captions else {}))
+                write_json(out / f"{photo}.json", facts)
         except InputError as error:
             if recipe.photos:
                 raise
@@ -114,7 +143,7 @@ def write_resynthesis(
         out: the folder to write to
         report: receives the share that is done, in [0, 1]
     """
-    scene = results.scene(photo, recipe.sun)
+    scene = results.scene(photo)
     if isinstance(recipe, kinds.TransferRecipe):
         table = results.with_table(recipe.table)
         replaced = {old: table[new] for old, new in recipe.materials.items()}
@@ -149,26 +178,17 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
         The scene with the new object's materials, the ground, and the object's pose.
 
     Raises:
-        InputError: The photo shows no place for the object, or the assumed sun stands below the ground.
+        InputError: The photo shows no place for the object.
     """
-    scene = results.scene(photo, recipe.sun)
+    scene = results.scene(photo)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    polished = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
-    polish = polished if any(recipe.ground.specular) else None
     ground = lowered_ground(results.ground(photo, neighbour), neighbour, recipe.ground.drop)
-    ground = msgspec.structs.replace(ground, polish=polish)
     if ground.plane.point @ ground.plane.normal >= 0:  # the camera stands at the origin
         raise InputError(
             f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, "
             "so a shadow on it would be invisible",
             key="photos",
             cure="name other photos, or give the photo's `ground` in dataset.yaml",
-        )
-    if recipe.sun is not None and results.sun_axis(photo, recipe.sun) @ YUP_FROM_CAMERA @ ground.plane.normal <= 0:
-        raise InputError(
-            f"the assumed sun is below the ground of photo '{photo}'",
-            key="sun.direction",
-            cure="give a direction that points upward: y is up in the photo",
         )
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
@@ -294,7 +314,7 @@ def render_view(
 
 
 def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
-    """Write the objects alone, from another view; the camera of another photo or a pose shows its whole frame.
+    """Write the objects alone, from another view.
 
     Args:
         recipe: the recipe to render
@@ -306,15 +326,8 @@ def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Pa
     Returns:
         The crop.
     """
-    crop: dict[str, Any] = {}
-    scene = results.scene(photo, recipe.sun)
-    view: View = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
-    if recipe.camera is not None:
-        camera, pose = results.camera(photo, recipe.camera)
-        scene = msgspec.structs.replace(scene, camera=camera)
-        view = lambda *_: pose  # noqa: E731
-    if recipe.camera is None or recipe.across is not None or recipe.width is not None:
-        scene, crop = framed_scene(recipe, results, photo, scene, [view])
+    view = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
+    scene, crop = framed_scene(recipe, results, photo, results.scene(photo), [view])
     traced = render_view(recipe, results, photo, scene, view)
     _write_transparent(out / photo, TracedPicture(traced, results.tone(photo)))
     return crop
@@ -325,7 +338,7 @@ def write_animation(
 ) -> None:
     """Write an animation in which the camera or the light turns once.
 
-    Each frame is a PNG.  All frames are a GIF on white and, if PyAV is installed, an MP4 on white.
+    Each frame is a PNG.  All frames are a GIF on white.
 
     Args:
         recipe: the recipe to render
@@ -337,7 +350,7 @@ def write_animation(
     turns = 360 * np.arange(recipe.frames) / recipe.frames
     views = [Orbit(float(degrees)).world_from_camera for degrees in turns]
     is_turntable = isinstance(recipe, kinds.TurntableRecipe)
-    scene, _ = framed_scene(recipe, results, photo, results.scene(photo, recipe.sun), views if is_turntable else STILL)
+    scene, _ = framed_scene(recipe, results, photo, results.scene(photo), views if is_turntable else STILL)
     pixels = []
     for k, degrees in enumerate(turns):
         report(k / recipe.frames)
@@ -351,7 +364,6 @@ def write_animation(
     for k, each in enumerate(pixels):
         write_png(out / photo / f"{k:03}.png", each)
     write_gif(out / f"{photo}.gif", pixels, recipe.seconds)
-    write_mp4(out / f"{photo}.mp4", pixels, recipe.seconds)
 
 
 def write_relit(
@@ -396,31 +408,6 @@ WRITERS: dict[type, Callable[[Any, SolvedSet, str, Path, Report], dict[str, Any]
     kinds.MovingLightRecipe: write_animation,
     kinds.RelightRecipe: write_relit,
 }
-
-
-def write_grid(recipe: kinds.GridRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
-    """Write balls of materials (rows) in lights (columns), each column at one exposure.
-
-    Args:
-        recipe: the recipe to render
-        results: the solved data set
-        out: the folder to write to
-        progress: receives the number of balls done and their total
-    """
-    materials = recipe.materials or results.names
-    lights = recipe.lights or results.photos
-    columns = []
-    total = len(materials) * len(lights)
-    for k, name in enumerate(lights):
-        light = results.light(name)
-        balls = []
-        for j, material in enumerate(materials):
-            progress(k * len(materials) + j, total, f"{material}, {name}")
-            balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples))
-        columns.append(TracedPicture(np.concatenate(balls)).with_exposure().pixels)
-    _write_transparent(out / "grid", TracedPicture(np.concatenate(columns, axis=1)))
-    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n")
-    progress(total, total)
 
 
 def _write_opaque(stem: Path, radiance: np.ndarray) -> None:

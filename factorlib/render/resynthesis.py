@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import binary_closing
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -166,7 +165,6 @@ LONGEST_STEP = 0.1  # largest spacing of nodes, radians
 NARROW = 1000.0  # sharpness above which a spline does not follow a lobe's highlight
 RIM = np.pi / 2 - 1e-3  # largest θ of a node, radians: the surface is still visible there
 MARGIN = 4  # periodic nodes beyond each end
-GAP = 6  # widest gap between observed normals that is closed, in cells
 SHADING = [f"{part}.{channel}" for part in ("diffuse", "specular") for channel in "RGB"]  # channels of `shading`
 
 
@@ -348,27 +346,12 @@ def nearest_surroundings(
     return visibility, bounced, place
 
 
-def render_balls(
-    reflector: Reflector, material: Reflectance, sizes: Sequence[int]
-) -> list[Float[np.ndarray, "size size 3"]]:
-    """Render a ball at several sizes, which share one evaluation.
-
-    Args:
-        reflector: the light
-        material: the ball's reflectance
-        sizes: widths of the pictures, in pixels
-
-    Returns:
-        A picture of radiance per size; zero outside the ball.
-    """
-    shapes = [ball_normals(size) for size in sizes]
-    normals = np.concatenate([each for each, _ in shapes]) * (1, -1, -1)  # in the camera's frame
-    radiance = front_radiance(reflector, material, normals)
-    pictures = []
-    for _, inside in shapes:
-        pictures.append(np.zeros((*inside.shape, 3)))
-        pictures[-1][inside], radiance = np.split(radiance, [inside.sum()])
-    return pictures
+def render_ball(reflector: Reflector, material: Reflectance, size: int) -> Float[np.ndarray, "size size 3"]:
+    """Render the radiance of a ball of `size` pixels' width; zero outside the ball."""
+    normals, inside = ball_normals(size)
+    picture = np.zeros((size, size, 3))
+    picture[inside] = front_radiance(reflector, material, normals * (1, -1, -1))  # in the camera's frame
+    return picture
 
 
 def front_radiance(
@@ -407,16 +390,3 @@ def front_radiance(
     splines = [RectBivariateSpline(theta, phi, channel, s=0) for channel in np.moveaxis(values, -1, 0)]
     smooth = np.stack([spline.ev(*angles) for spline in splines], axis=-1).clip(0)
     return smooth + sharp(material, normals, np.broadcast_to(FRONT, normals.shape))
-
-
-def observed_cells(normals: Float[np.ndarray, "n 3"], size: int) -> Bool[np.ndarray, "size size"]:
-    """Return the pixels of a ball whose normals were observed, with gaps of the normals' mean spacing closed."""
-    cells = np.zeros((size, size), bool)
-    if len(normals) == 0:
-        return cells
-    # mark the cells of the normals, then close gaps of up to the mean spacing of the normals
-    column, row = (np.clip(((normals[:, k] + 1) / 2 * size).astype(int), 0, size - 1) for k in (0, 1))
-    cells[row, column] = True
-    gap = int(np.clip(np.ceil(size / np.sqrt(len(normals))), 1, GAP))
-    closed = binary_closing(np.pad(cells, gap), np.ones((3, 3)), iterations=gap)[gap:-gap, gap:-gap]
-    return closed & ball_normals(size)[1]

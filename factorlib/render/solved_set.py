@@ -11,24 +11,21 @@ from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, MeshIns
 from factorlib.errors import InputError, did_you_mean
 from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.solids import sphere
-from factorlib.geometry.camera import Camera
 from factorlib.geometry.ground import Plane
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import apply_tone, invert_tone
-from factorlib.light.lobes import Lobes
-from factorlib.meshes.mesh import Mesh, scale_mesh, without_paint
+from factorlib.meshes.mesh import Mesh, without_paint
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
-from factorlib.recipe.kinds import BALL, AssumedSun, Table, ViewCamera, is_light_file, is_mesh_file, materials_of
+from factorlib.recipe.kinds import BALL, Table, is_light_file, is_mesh_file, materials_of
 from factorlib.render.ground import ground_below, level_ground
 from factorlib.render.insertion import GroundSurface
-from factorlib.render.photo_scene import DistantLight, LightMap, PhotoScene, PlacedMesh, Tone, identity_tone, with_sun
+from factorlib.render.photo_scene import DistantLight, LightMap, PhotoScene, PlacedMesh, Tone, identity_tone
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface_table import read_surface
-from factorlib.results.texture_table import read_textures
+from factorlib.results.texture_table import read_surface, read_textures
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import rigid
 
@@ -70,16 +67,8 @@ class SolvedSet:
         self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, *moved, textures)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
-    def scene(self, photo: str, sun: AssumedSun | None = None) -> PhotoScene:
-        """Return the photo's objects in their poses and in its light.
-
-        Args:
-            photo: name of the photo
-            sun: an assumed sun, which replaces the light's own suns
-
-        Raises:
-            InputError: The photo has no objects.
-        """
+    def scene(self, photo: str) -> PhotoScene:
+        """Return the photo's objects in their poses and in its light; InputError for a photo without objects."""
         poses = self.poses[photo]
         objects = self.objects[photo]
         if not objects.objects:
@@ -96,46 +85,11 @@ class SolvedSet:
                     obj.name,
                     "; ".join(poses.objects[obj.name].doubts),
                 )
-        camera = self._lens(photo)
+        height, width = self._masks(photo)["label"].shape
+        camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
         depth = ALL_BOUNCES if self.table.model.interreflection else DIRECT
-        light = self.light(photo)
-        if sun is not None:
-            assert isinstance(light, Lobes)  # a photo's, and no map of a file
-            light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
-        return PhotoScene(camera, placed, light, self.materials, depth, self.world_from_map(photo)[:, 1])
-
-    def camera(self, photo: str, view: ViewCamera) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
-        """Return the camera of a view of a photo's objects, and its pose in the world of the photo's scene.
-
-        Raises:
-            InputError: The photo has no object in common with that of the camera.
-        """
-        objects = self.poses[photo].objects
-        others = self.poses[view.photo or photo].objects
-        common = [name for name in objects if name in others]
-        if not common:
-            raise InputError(
-                f"the photos '{photo}' and '{view.photo}' have no object in common, which would place the camera",
-                key="camera.photo",
-                cure=f"name a photo that shows one of {', '.join(objects)}",
-            )
-        # x_cam = R x_object + t, by a pose that is not doubtful if there is one
-        name = next((n for n in common if view.pose or not (objects[n].left_out or others[n].left_out)), common[0])
-        rows = view.pose or np.column_stack([others[name].rotation, others[name].translation])
-        pose = objects[name].pose
-        world_from_object = rigid(YUP_FROM_CAMERA @ pose.rotation, YUP_FROM_CAMERA @ pose.translation)
-        return self._lens(view.photo or photo), world_from_object @ np.linalg.inv(np.vstack([rows, [0, 0, 0, 1]]))
-
-    def _lens(self, photo: str) -> Camera:
-        """Return the camera of a photo, in pixels of the picture from `masks`."""
-        height, width = self._masks(photo)["label"].shape
-        return self.poses[photo].camera.camera(width, height)
-
-    def sun_axis(self, photo: str, sun: AssumedSun) -> Float[np.ndarray, "3"]:
-        """Return the unit direction to a sun in the photo's camera axes."""
-        direction = np.array(sun.direction) / np.linalg.norm(sun.direction)
-        return YUP_FROM_CAMERA @ self.world_from_map(photo) @ direction
+        return PhotoScene(camera, placed, self.light(photo), self.materials, depth, self.world_from_map(photo)[:, 1])
 
     def world_from_map(self, photo: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the frame of the photo's exported light to the world of the photo's scene.
@@ -305,7 +259,7 @@ class SolvedSet:
         pose = poses.objects[obj.name]
         mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
-        return PlacedMesh(obj.name, scale_mesh(mesh, pose.scale), tuple(self.names), place)
+        return PlacedMesh(obj.name, mesh, tuple(self.names), place)
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:

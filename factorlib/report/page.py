@@ -1,41 +1,137 @@
 """Content of the report's page, collected and rendered into the template."""
 
 import json
-import re
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
 from urllib.parse import quote
+
+import jinja2
+import msgspec
+import numpy as np
 
 from factorlib.evaluate.predicted_views import describe_views
 from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import data_uri, read_png
-from factorlib.jsonfile import read_json
+from factorlib.images.tone import srgb_encode
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
-from factorlib.report.template import headlines, render_template, sentences
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
-from factorlib.results.poses import AS_IT_IS
+
+# Rendering of this package's templates, which hold the text of the pages.
+
+MINUS = "\u2212"
+DASH = "\u2013"
+
+
+def render_template(template: str, **context: Any) -> str:
+    """Render a template; values are escaped, except in templates that end in .txt."""
+    folder = files("factorlib.report") / "templates"
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
+        autoescape=lambda name: not (name or "").endswith(".txt"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {each.__name__: each for each in (number, significant, percent, duration, css_colour)}
+    environment.filters |= {
+        "in_script": _in_script,
+        "plain": lambda value: f"{value:.6g}",
+        "worst": lambda values: max(values, key=abs),
+    }
+    environment.tests["of_a_parameter"] = lambda change: ": parameter " in change
+    return environment.get_template(template).render(context)
+
+
+def sentences(template: str, **context: Any) -> list[str]:
+    """Render a template of sentences and return its lines that are not empty."""
+    return list(filter(None, render_template(template, **context).split("\n")))
+
+
+def headlines(metrics: Metrics) -> list[dict[str, str]]:
+    """Return the headline numbers: re-synthesis, if pixels count, and materials and relighting, if there is a truth.
+
+    They are in words: label, value and unit, the number `beside` which it stands, and its `meaning` for a lay reader.
+    """
+    keys = ("label", "value", "unit", "beside", "meaning")
+    return [dict(zip(keys, line.split(" | "), strict=True)) for line in sentences("headlines.txt", metrics=metrics)]
+
+
+def _in_script(value: Mapping) -> str:
+    """Return JSON that is safe inside a script element: no name in it can contain `</script>`."""
+    text = msgspec.json.encode(value).decode("utf-8")
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Format with fixed digits and a true minus sign; a dash for an unknown value.
+
+    >>> number(-0.1234, 2), number(None)
+    ('−0.12', '–')
+    """
+    if value is None or not math.isfinite(value):
+        return DASH
+    return f"{value:.{digits}f}".replace("-", MINUS)
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """Format with significant digits, without an exponent for sizes from 1e-4 to 1e6.
+
+    >>> significant(0.012345), significant(12345.0), significant(0.0)
+    ('0.0123', '12300', '0')
+    """
+    if value is None or not math.isfinite(value) or value == 0:
+        return "0" if value == 0 else DASH
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}".replace("-", MINUS)
+    places = digits - 1 - math.floor(math.log10(abs(value)))
+    return number(round(value, places), max(0, places))
+
+
+def percent(fraction: float | None, digits: int = 1) -> str:
+    """Format a fraction in percent.
+
+    >>> percent(0.0423)
+    '4.2 %'
+    """
+    return DASH if fraction is None else f"{number(100 * fraction, digits)} %"
+
+
+def duration(seconds: float | None) -> str:
+    """Format seconds, as minutes and seconds from one minute on.
+
+    >>> duration(4.31), duration(75)
+    ('4.3 s', '1 min 15 s')
+    """
+    if seconds is None:
+        return DASH
+    return f"{seconds:.1f} s" if seconds < 60 else f"{round(seconds) // 60} min {round(seconds) % 60:02d} s"
+
+
+def css_colour(linear: Sequence[float]) -> str:
+    """Return a reflectance as a CSS colour: sRGB-encoded, clamped to [0, 1].
+
+    >>> css_colour([1.0, 0.18, 0.0])
+    'rgb(255 118 0)'
+    """
+    return f"rgb({' '.join(str(round(255 * v)) for v in srgb_encode(np.clip(linear, 0.0, 1.0)).tolist())})"
+
 
 LOW_IOU = 0.85  # silhouette overlap below which a pose is doubted
-MEASURES = {
-    "median": "median",
-    "p95": "95th percentile",
-    "p99": "99th percentile",
-    "worst": "worst",
-    "samples": "samples",
-}
 FILES = {  # links of the page: stage and pattern of its files
     "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"),
     "objects, glTF": ("export", "*.glb"),
     "lights, EXR": ("export", "illumination/*.exr"), "lights, HDR": ("export", "illumination/*.hdr"),
     "lights without their suns, EXR": ("export", "illumination/*_sky.exr"),
     "how sure lights are": ("export", "coverage/*.exr"), "Mitsuba scenes": ("export", "scenes/*.xml"),
-    "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"),
+    "Blender scenes": ("export", "scenes/blender.py"),
     "meshes": ("export", "meshes/*.ply"),
     "re-syntheses": ("render", "resynthesis/*.exr"), "metrics.json": ("evaluate", "metrics.json"),
 }  # fmt: skip
@@ -77,12 +173,10 @@ def page(
         tags=tags,
         materials=_materials(run, cells),
         cells=cells,
-        maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
         surface=run.surface,
         texture=run.texture,
         exchange=run.exchange,
         surfaces=surfaces,
-        training=_training(run),
         cost=stage_costs(run.events(), STAGES),
         viewed=viewed,
         **_facts(run, metrics),
@@ -106,7 +200,6 @@ def _facts(run: Artifacts, metrics: Metrics) -> dict[str, Any]:
         "poses": [(p, _overlay(run, p), poses[p], facts.get(p)) for p in run.set.photos if p in poses],
         "doubted": any(obj.doubts or obj.left_out for photo in poses.values() for obj in photo.objects.values()),
         "low_iou": LOW_IOU,
-        "as_it_is": AS_IT_IS,
         "lights": list(filter(None, lights)),
         "missing": {why: [name for _, name in group] for why, group in groupby(reasons, itemgetter(0))},
     }
@@ -182,32 +275,6 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
         return None
     crop = pixels[pictures.mask_box(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
     return data_uri(pictures.downsample(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
-
-
-# ── Training ─────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _training(run: Artifacts) -> dict[str, Any] | None:
-    """Return the table of accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}.
-
-    `columns` are the measures that occur.  `lines` are (level, name, numbers), where level 0 is a network, 1 a quantity
-    and 2 a bin of it.
-    """
-    accuracy = run.read(read_json, "train", "accuracy.json")
-    if accuracy is None:
-        return None
-    columns = {key: title for key, title in MEASURES.items() if f"'{key}'" in str(accuracy)}
-    lines = [line for part, table in sorted(accuracy.items(), reverse=True) for line in _lines(part, table, 0)]
-    return {"columns": columns, "lines": lines}
-
-
-def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Mapping]]:
-    """Yield the lines of a table; bins are sorted by their leading numbers: "3 to 30" before "30 to 300"."""
-    yield level, name, table
-    leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
-    inner = [key for key, value in table.items() if isinstance(value, dict)]
-    for key in sorted(inner, key=lambda key: (float(number[0]) if (number := leading.match(key)) else 0.0, key)):
-        yield from _lines(key, table[key], level + 1)
 
 
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -1,4 +1,4 @@
-"""Pictures of the report: photos beside re-syntheses, balls, reflectance maps, and lights."""
+"""Pictures of the report: photos beside re-syntheses, balls, and lights."""
 
 from collections.abc import Mapping, Sequence
 from math import ceil
@@ -14,7 +14,6 @@ from scipy.sparse import csr_array
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.evaluate.picture_errors import agreeing_pixels
-from factorlib.images.exr import read_exr
 from factorlib.images.picture import data_uri, exposure_of, nearest_tags, picture, png_bytes
 from factorlib.images.tone import srgb_encode
 from factorlib.render.photo_scene import TracedPicture, rotate_light, traced_photo
@@ -23,8 +22,6 @@ from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
-from factorlib.urm.extract import with_surface_normals
-from factorlib.urm.observations import Observations, read_observations
 
 FIRST_SAMPLES = 16  # samples per pixel of the first screen's pictures
 AMPLIFICATION = 4  # factor on the difference between photo and re-synthesis
@@ -32,9 +29,7 @@ UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB colour of pixels in the mask th
 DISAGREES = np.array([0.92, 1.0, 0.0])  # sRGB colour of pixels where mesh and mask name different materials
 MAGENTA = (214, 40, 120)
 UNKNOWN = Reflectance((0.2,) * 3, (0.0,) * 3, 1.0)  # stands for a material that was not solved
-MAP_SIZE = 64  # largest width of a measured map, cells
 CLAY_LIGHT = np.array([-0.5, -0.6, -0.6245])  # camera frame, unit: from above, left of the camera
-LEAST_OBSERVED = 0.002  # share of a disc below which observed normals are not outlined
 
 Pixels = UInt8[np.ndarray, "h w c"]
 
@@ -85,7 +80,7 @@ def ball_rgba(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np
 
 
 def exposures(run: Artifacts) -> dict[str, float]:
-    """Return the display exposure of each photo, which balls and reflectance maps in its light share."""
+    """Return the display exposure of each photo, which balls in its light share."""
     photos = metrics.photos if (metrics := run.metrics) else {}
     return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
 
@@ -273,53 +268,6 @@ def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> dic
     radiance = run.rgb("render", f"materials/{photo}/{material}")
     uri = None if radiance is None else data_uri(ball_rgba(downsample(radiance, 96), exposure))
     return {"material": material, "photo": photo, "observed": observed, "uri": uri}
-
-
-def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[dict[str, Any]]:
-    """Return one cell per material: the solved map with the observed normals outlined, and the measured map or None.
-
-    Args:
-        run: results of the run
-        photo: name of the photo
-        exposure: exposure of the pictures
-    """
-    cells = []
-    observations = run.read(read_observations, "urm", f"{photo}.parquet")
-    observations = observations and with_surface_normals(observations, run.folders.get("surface"))
-    for index, name in enumerate(run.set.materials):
-        channels = run.read(read_exr, "render", f"reflectance_maps/{photo}/{name}.exr")
-        samples = observations and observations.take(observations.material == index)
-        measured = data_uri(measured_map(samples, exposure)) if samples else None
-        uri = None if channels is None else data_uri(_outline_observed(channels, exposure))
-        cells.append({"material": name, "uri": uri, "measured": measured})
-    return cells
-
-
-def _outline_observed(channels: Channels, exposure: float) -> Pixels:
-    """Return the solved map with an outline of the observed normals, white on dark and black on bright."""
-    pixels = ball_rgba(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
-    observed = channels.get("observed", np.zeros(pixels.shape[:2])) > 0.5
-    if observed.mean() > LEAST_OBSERVED:
-        line = outline(observed | ~(pixels[..., 3] > 0))
-        pixels[line, :3] = np.where(pixels[line, :3].mean(axis=-1, keepdims=True) > 127.5, 0, 255)
-    return pixels
-
-
-def measured_map(observations: Observations, exposure: float) -> UInt8[np.ndarray, "s s 4"]:
-    """Return the mean radiance by normal, seen from the front, as RGBA; transparent without observations.
-
-    The disc's width leaves about two observations per cell, and is at most `MAP_SIZE` cells.
-    """
-    n = observations.normal
-    side = int(np.clip(np.sqrt(len(observations) * 2 / np.pi), 8, MAP_SIZE))
-    column, row = (np.clip(((n[:, k] + 1) / 2 * side).astype(int), 0, side - 1) for k in (0, 1))  # x right, y down
-    # mean radiance of each cell
-    cell = row * side + column
-    weight = np.bincount(cell, minlength=side**2)
-    total = np.stack([np.bincount(cell, c, side**2) for c in observations.radiance.T], axis=-1)
-    mean = (total / np.maximum(weight, 1)[:, None]).reshape(side, side, 3)
-    alpha = np.where(weight > 0, 255, 0).astype(np.uint8).reshape(side, side, 1)
-    return np.concatenate([picture(mean, exposure), alpha], axis=-1)
 
 
 # ── Lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -30,7 +30,6 @@ from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import SolvedMaterial
-from factorlib.results.poses import AS_IT_IS
 from factorlib.tracing.scene import sharpen_lobes
 
 MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
@@ -104,7 +103,6 @@ class ViewedObject(msgspec.Struct, frozen=True):
     name: str
     mesh: str
     variant: str = ""
-    scale: tuple[float, float, float] = AS_IT_IS
     pose: Pose = Pose(YUP_FROM_CAMERA.T, np.zeros(3))
 
 
@@ -113,7 +111,7 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
 
     objects  photo, name; mesh, its index; materials, by part; painted, by part; rotation, y-up camera from object, row
              by row; eye, unit vector from the object to that camera
-    meshes   name and `_mesh`; poses that scale a mesh by different factors have a mesh each
+    meshes   name and `_mesh`
     """
     files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
     parts = {name: dict(sorted(read_parts_of_glb(file).items())) for name, file in files.items()}
@@ -121,13 +119,13 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
     for name, geometry in loaded.items():
         _set_paint(geometry, parts[name], run.exported.materials)
     entries = _viewed_objects(run, objects, files)
-    kinds = sorted({(each.mesh, each.scale) for each in entries})
-    triangles = sum(len(part.faces) for name, _ in kinds for part in loaded[name].values())
+    kinds = sorted({each.mesh for each in entries})
+    triangles = sum(len(part.faces) for name in kinds for part in loaded[name].values())
     share = min(1.0, MOST_TRIANGLES / max(1, triangles))
-    meshes = [_mesh(loaded[name], np.array(scale), share) for name, scale in kinds]
+    meshes = [_mesh(loaded[name], share) for name in kinds]
     placed = []
     for each in entries:
-        mesh = kinds.index((each.mesh, each.scale))
+        mesh = kinds.index(each.mesh)
         worn = {name: part.materials.get(each.variant, part.materials[""]) for name, part in parts[each.mesh].items()}
         painted = {name for name, part in loaded[each.mesh].items() if PAINT in part.vertex_attributes}
         toward = -(YUP_FROM_CAMERA @ each.pose.apply(meshes[mesh][1][None])[0])
@@ -145,7 +143,7 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
         )
     return {
         "objects": placed,
-        "meshes": [{"name": name, **mesh} for (name, _), (mesh, _) in zip(kinds, meshes, strict=True)],
+        "meshes": [{"name": name, **mesh} for name, (mesh, _) in zip(kinds, meshes, strict=True)],
     }
 
 
@@ -157,7 +155,7 @@ def _viewed_objects(run: Artifacts, objects: Mapping[str, ObjectsSlice], meshes:
             entry = run.poses[photo].objects.get(obj.name)
             if obj.mesh in meshes and entry is not None and not entry.left_out:
                 variant = variant_name(obj.materials)
-                entries.append(ViewedObject(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
+                entries.append(ViewedObject(photo, obj.name, obj.mesh, variant, entry.pose))
     return entries + [ViewedObject(None, name, name) for name in meshes if all(name != each.mesh for each in entries)]
 
 
@@ -184,10 +182,8 @@ def _set_paint(
         )
 
 
-def _mesh(
-    parts: Mapping[str, trimesh.Trimesh], scale: Float[np.ndarray, "3"], share: float
-) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
-    """Return a mesh times a scale, with at most `share` of its triangles, and its centre.
+def _mesh(parts: Mapping[str, trimesh.Trimesh], share: float) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
+    """Return a mesh, with at most `share` of its triangles, and its centre.
 
     vertices         uint16, 3 per vertex, v / 32767.5 − 1 in radii of the mesh from its centre
     normals          int16, times 32767
@@ -197,7 +193,7 @@ def _mesh(
     sight            see `_sight`
     simplified_from  number of triangles before simplification, if it was simplified
     """
-    vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
+    vertices = np.concatenate([part.vertices for part in parts.values()])
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
     pieces = [_simplify(part, share) for _, part in sorted(parts.items())]
@@ -205,9 +201,9 @@ def _mesh(
     first = np.cumsum([0, *map(len, vertices)])
     labels = np.arange(1, len(pieces) + 1, dtype=np.int16)
     mesh = Mesh(
-        (np.vstack(vertices) * scale - centre) / radius,
+        (np.vstack(vertices) - centre) / radius,
         np.vstack([face + start for face, start in zip(faces, first, strict=False)]),
-        unit(np.vstack(normals) / scale),
+        unit(np.vstack(normals)),
         np.repeat(labels, [len(face) for face in faces]),
         any(bool(part.visual.material.doubleSided) for part in parts.values()),  # type: ignore[union-attr]
         np.vstack(colours) if any(PAINT in part.vertex_attributes for part in parts.values()) else None,

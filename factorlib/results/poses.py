@@ -9,20 +9,19 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
+from factorlib.dataset.schema import ExternalCamera
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose, is_pose
 from factorlib.jsonfile import read_result
 from factorlib.results.materials import Vec3, vec3
 
 FILE = "poses.json"
-AS_IT_IS = (1.0, 1.0, 1.0)
-CURE = "name the folder of a result of `align`"
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class PoseEntry(msgspec.Struct, frozen=True):
-    """The pose cam_from_object: x_cam = rotation · (scale ∘ x_object) + translation, with the object's scale."""
+    """The pose cam_from_object: x_cam = rotation · x_object + translation."""
 
     rotation: tuple[Vec3, Vec3, Vec3]
     translation: Vec3
@@ -49,13 +48,11 @@ class ObjectPose(PoseEntry, frozen=True):
     """An object's pose and its measures of confidence (`factorlib.align.reliability`); None for what was not measured.
 
     Attributes:
-        scale: factors on the mesh's axes
-        source: origin of the pose: found, keypoints, refined (an earlier result), or who gave it
+        source: origin of the pose: found, keypoints, or who gave it
         doubts: reasons against the pose, in words
         left_out: True if the solve leaves the object out because of them
     """
 
-    scale: tuple[Positive, Positive, Positive] = AS_IT_IS
     silhouette_iou: float | None = None
     label_agreement: float | None = None
     source: str | None = None
@@ -63,7 +60,6 @@ class ObjectPose(PoseEntry, frozen=True):
     runner_up: RunnerUpPose | None = None
     contour_error: float | None = None
     normal_stderr_deg: float | None = None
-    mirrored_score: float | None = None
     doubts: list[str] = []
     left_out: bool = False
 
@@ -107,22 +103,22 @@ def pose_fields(pose: Pose) -> dict[str, Any]:
     return {"rotation": tuple(map(vec3, pose.rotation)), "translation": vec3(pose.translation)}
 
 
-def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
+def read_poses(path: str | Path) -> dict[str, PhotoPoses]:
     """Read poses.json: poses by photo; InputError if the file has another form."""
-    photos = read_result(path, dict[str, PhotoPoses], "align", cure)
+    photos = read_result(path, dict[str, PhotoPoses], "align")
     for name, photo in photos.items():
-        _check(photo, path, f"{name}.objects", cure)
+        _check(photo, path, f"{name}.objects")
     return photos
 
 
 def read_photo_poses(path: str | Path) -> PhotoPoses:
     """Read the poses of one photo as `align` writes them; InputError if the file has another form."""
     photo = read_result(path, PhotoPoses, "align")
-    _check(photo, path, "objects", "run the stage `align` again")
+    _check(photo, path, "objects")
     return photo
 
 
-def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
+def _check(photo: PhotoPoses, path: str | Path, key: str) -> None:
     for name, obj in photo.objects.items():
         for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
@@ -130,5 +126,86 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
                     "the pose is invalid: its rotation is not a rotation matrix, or a number is not finite",
                     file=path,
                     key=f"{key}.{name}",
-                    cure=cure,
+                    cure="run the stage `align` again",
                 )
+
+
+# photos.json of `masks`: facts about each photo.
+#
+# `masks` writes the entry of one photo as <photo>.json; photos.json collects them.
+
+Size = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class PhotoFacts(msgspec.Struct, frozen=True):
+    """Facts about one photo, in pixels of <photo>.exr of `masks`, each of which covers factor² of the photo's.
+
+    Attributes:
+        original_size: width and height of the photo itself, as displayed
+        focal_px: None if it is unknown
+        focal_source: dataset or exif
+        exposure: t·S/N² from EXIF, None if it is unknown
+        pixels: number of valid pixels by material
+        clipped_fraction: share of them clipped in any channel
+    """
+
+    width: Size
+    height: Size
+    factor: Size
+    original_size: tuple[Size, Size]
+    focal_px: Positive | None = None
+    focal_source: str | None = None
+    encoding: str = "srgb"
+    exposure: float | None = None
+    illumination: str = ""
+    pixels: dict[str, int] = {}
+    clipped_fraction: float = 0.0
+
+
+def read_photo_facts(path: str | Path) -> PhotoFacts:
+    """Read the facts of one photo as `masks` writes them; InputError if the file has another form."""
+    return read_result(path, PhotoFacts, "masks")
+
+
+def read_photos(path: str | Path) -> dict[str, PhotoFacts]:
+    """Read photos.json: facts by photo; InputError if the file has another form."""
+    return read_result(path, dict[str, PhotoFacts], "masks")
+
+
+# shapes.json: cameras from structure from motion, and shapes reconstructed from masks.
+
+SHAPES_FILE = "shapes.json"
+
+
+class ShapeEntry(msgspec.Struct, frozen=True):
+    """A reconstructed shape.
+
+    Attributes:
+        kind: hull, lathe, ball, box or cylinder
+        extent: size of its bounding box, in its own units
+        photos: photos whose outlines were used
+        overlap: mean IoU of the shape with these outlines
+    """
+
+    kind: str
+    extent: tuple[float, float, float]
+    triangles: int
+    photos: list[str]
+    overlap: float
+
+
+class ShapesTable(msgspec.Struct, frozen=True):
+    """Content of shapes.json.
+
+    Attributes:
+        cameras: cameras that structure from motion placed, by photo
+        meshes: shapes by name
+    """
+
+    cameras: dict[str, ExternalCamera] = {}
+    meshes: dict[str, ShapeEntry] = {}
+
+
+def read_shapes(folder: Path | None) -> ShapesTable:
+    """Read the table in the folder of the stage `shapes`; it is empty without a folder."""
+    return ShapesTable() if folder is None else read_result(folder / SHAPES_FILE, ShapesTable, "shapes")

@@ -117,25 +117,16 @@ def photo_sets() -> Provider:
 
 
 class Project(msgspec.Struct, frozen=True):
-    """A checkout: pipeline.yaml, the package of its stages, data/ and build/.
-
-    shipped: folder of pipeline.yaml, stages and recipes if the installed package brings them; `root` is then any folder
-    """
+    """A checkout: pipeline.yaml, the package of its stages, data/ and build/."""
 
     root: Path
     provider: Provider
     package: str = "stages"
-    shipped: Path | None = None
-
-    @property
-    def code_root(self) -> Path:
-        """Folder of pipeline.yaml and of the package of its stages."""
-        return self.shipped or self.root
 
     @property
     def pipeline_file(self) -> Path:
         """File that declares the stages."""
-        return self.code_root / PIPELINE
+        return self.root / PIPELINE
 
     @property
     def build(self) -> Path:
@@ -153,8 +144,8 @@ class Project(msgspec.Struct, frozen=True):
         return folder.resolve()
 
     def command(self, verb: str, dataset: str) -> str:
-        """Format the command of a verb for a dataset, for a user of the checkout or of the installed package."""
-        return f"{f'factorlib {verb} -d ' if self.shipped else f'make {verb} DATASET='}{shlex.quote(dataset)}"
+        """Format the command of a verb for a dataset."""
+        return f"make {verb} DATASET={shlex.quote(dataset)}"
 
     def short_path(self, path: Path) -> str:
         """Format a path for messages: relative to the current folder if it lies below."""
@@ -199,8 +190,8 @@ class Project(msgspec.Struct, frozen=True):
         Raises:
             InputError: A recipe does not exist or is wrong, or two have one name.
         """
-        roots = [root / "recipes" for root in dict.fromkeys([self.code_root, self.root])]
-        folders = [*roots, *(root / data.folder.name for root in roots)]  # The dataset's own take precedence.
+        shared = self.root / "recipes"
+        folders = [shared, shared / data.folder.name]  # The dataset's own take precedence.
         known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
         paths: list[Path] = []
         for word in words:
@@ -218,7 +209,7 @@ class Project(msgspec.Struct, frozen=True):
             try:
                 recipes[path.stem] = data.recipe(path)
             except InputError as error:
-                if ALL not in words or path.parent not in roots:
+                if ALL not in words or path.parent != shared:
                     raise
                 log.warning("RECIPE=all leaves out %s: %s", path.stem, error)
         return recipes

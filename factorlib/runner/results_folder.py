@@ -1,4 +1,4 @@
-"""The folders build/<dataset> that a user sees, and the verbs that maintain them and the store: verify, clean, gc.
+"""The folders build/<dataset> that a user sees, and the verbs that maintain them and the store: verify and clean.
 
     <stage>       link to the current result of a stage, in build/store; of a stage over photos, to a view of all
     current.json  key of each step
@@ -13,9 +13,8 @@ import contextlib
 import os
 import shlex
 import shutil
-import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,10 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.plan import Step, hash_of
-from factorlib.runner.project import RESERVED, SHARED, Project, check_name
+from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.run_folder import no_runs
-from factorlib.runner.store import DECODE_ERRORS, Entry, Hash, Store, stamps_of
+from factorlib.runner.store import DECODE_ERRORS, Hash, Store, stamps_of
 from factorlib.wholefile import replace_file, write_text
-
-NO_STAGE = "left over"  # damaged results, and files without a key
 
 
 class ResultsFolder(msgspec.Struct, frozen=True):
@@ -170,89 +167,6 @@ def make_view(store: Store, outputs: Mapping[str, str], gather: str | None) -> P
     return view
 
 
-# ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int:
-    """List the results that no current result is or was made from, and delete them if `confirm` returns True.
-
-    Raises:
-        InputError: A run is going on, or the store is shared.
-    """
-    if (store := Store(project.store)).root != project.build / "store":
-        fault = "other checkouts share this store, and the results that they need are not known here"
-        cure = (
-            f"leave {SHARED} out for the store of this checkout; in the shared one delete old folders in `trees`, old "
-            "files in `keys`, and all of `views` and `damaged`; the next run makes views again"
-        )
-        raise InputError(fault, file=store.root, cure=cure)
-    with no_runs(store):
-        keys, trees, leftovers = _unused(project, store)
-        stages = {entry.output: entry.record["stage"] for path in keys if (entry := store.entry(path.stem))}
-        groups: dict[str, list[Path]] = {}
-        for path in trees:
-            groups.setdefault(stages.get(path.name, NO_STAGE), []).append(path)
-        for stage, paths in groups.items():
-            size = sum(file.stat().st_size for path in paths for file in path.rglob("*") if file.is_file())
-            dates = sorted(time.strftime("%Y-%m-%d", time.localtime(path.stat().st_mtime)) for path in paths)
-            period = " to ".join(dict.fromkeys((dates[0], dates[-1])))
-            print(f"{stage:<10} {_results(len(paths)):>12} {size / 1e6:>9.1f} MB   of {period}")
-        if groups and not confirm():
-            print("nothing was deleted")
-            return 0
-        for path in keys + trees + leftovers:
-            if path.is_dir() and not path.is_symlink():  # renamed first: a part would count as a damaged result
-                aside = store.tmp / f"run-gc-{path.name}"
-                os.rename(path, aside)
-                shutil.rmtree(aside)
-            else:
-                path.unlink()
-    print(f"deleted {_results(len(trees))} that nothing uses")
-    return 0
-
-
-def _results(count: int) -> str:
-    return f"{count} result{'' if count == 1 else 's'}"
-
-
-def _unused(project: Project, store: Store) -> tuple[list[Path], list[Path], list[Path]]:
-    """List the store's entries that no current result refers to: keys, trees, and the rest (locks, drafts)."""
-    current = [ResultsFolder(path.parent).keys() for path in project.build.glob("*/current.json")]
-    keys = _needed(store, {key for table in current for key in table.values()})
-    trees = {entry.output for key in keys if (entry := store.entry(key))}
-    unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
-    leftovers = [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
-    linked = {os.path.realpath(link) for link in project.build.glob("*/*") if link.is_symlink()}
-    leftovers += [view for view in store.views.glob("*") if os.path.realpath(view) not in linked]
-    orphans = [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees]
-    return unused, orphans, leftovers
-
-
-def _needed(store: Store, current: set[str]) -> set[str]:
-    """Return the current keys and the keys of all results that they were made from, however indirectly.
-
-    A result is current only while its inputs are in the store, even if another run has since made these with other
-    parameters.
-    """
-    entries = {path.stem: entry for path in store.keys.glob("*.json") if (entry := store.entry(path.stem))}
-    makers: dict[tuple[str, str], set[str]] = {}
-    for key, entry in entries.items():
-        makers.setdefault((f"input:{step_of(entry)}", entry.output), set()).add(key)
-    needed = set(current)
-    stack = [key for key in current if key in entries]
-    while stack:
-        inputs = [item for item in entries[stack.pop()].record.items() if item[0].startswith("input:")]
-        above = {key for item in inputs for key in makers.get(item, ())} - needed
-        stack += above
-        needed |= above
-    return needed
-
-
-def step_of(entry: Entry) -> Step:
-    """Return the step that has made a result."""
-    return Step(entry.record["stage"], entry.record.get("photo"), entry.record.get("recipe"))
-
-
 # ── verify and clean ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -262,29 +176,28 @@ def verify(project: Project, dataset: str | None) -> int:
     The next run that needs a damaged result makes it again.
     """
     store = Store(project.store)
-    users: dict[str, list[str]] = {} if dataset else {path.stem: [] for path in store.keys.glob("*.json")}
-    for results in find_results(project, dataset):
-        for step, key in results.keys().items():
-            users.setdefault(key, []).append(f"{step} ({results.folder.name})")
+    keys = {key for results in find_results(project, dataset) for key in results.keys().values()}
+    keys |= set() if dataset else {path.stem for path in store.keys.glob("*.json")}
     damaged = 0
-    for key, steps in sorted(users.items()):
+    for key in sorted(keys):
         entry = store.entry(key)
         place = store.trees / entry.output if entry else store.keys / f"{key}.json"
         faults = store.faults(entry, reread=True) if entry else ["missing, not readable, or not of this key"]
         if faults:
             damaged += 1
-            name = ", ".join(steps) or (f"{step_of(entry)} (of an earlier run)" if entry else "a result")
+            record = entry.record if entry else {"stage": "a result"}
+            name = Step(record["stage"], record.get("photo"), record.get("recipe"))
             print(f"{name}: {project.short_path(place)}", *faults, sep="\n    ")
     store.hashes.save()
     outcome = f"{damaged} damaged; the next run that needs one makes it again" if damaged else "all are sound"
-    print(f"{_results(len(users))} read: {outcome}")
+    print(f"{len(keys)} results read: {outcome}")
     return 1 if damaged else 0
 
 
 def clean(project: Project, dataset: str | None) -> int:
     """Delete the results folder of a dataset, or all of them and the store of this checkout.
 
-    The results of one dataset stay in the store until the next gc.
+    The results of one dataset stay in the store.
     """
     deleted = [results.folder for results in find_results(project, dataset)]
     store = Store(project.store)

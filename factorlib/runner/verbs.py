@@ -1,6 +1,5 @@
 """Verbs of the command line.  Each shows or runs the same plan, and returns the exit code."""
 
-import ast
 import contextlib
 import inspect
 import logging
@@ -16,17 +15,16 @@ from collections.abc import Callable, Iterator, Sequence, Sized
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 
 import msgspec
 
-from factorlib.errors import InputError, did_you_mean
+from factorlib.errors import InputError
 from factorlib.runner.dataset_state import DatasetState, Request, read_state
-from factorlib.runner.plan import PlannedStep, Step, difference, summarize
+from factorlib.runner.plan import PlannedStep, Step, summarize
 from factorlib.runner.project import RESERVED, Pipeline, Project, StageCode, check_name, read_pipeline
-from factorlib.runner.results_folder import ResultsFolder, all_results, find_results, results_of
-from factorlib.runner.store import Entry, Store, is_locked
-from factorlib.wholefile import write_text
+from factorlib.runner.results_folder import results_of
+from factorlib.runner.store import Entry, is_locked
 
 # exit codes as in shells
 INTERRUPTED = 128 + signal.SIGINT
@@ -156,60 +154,17 @@ def _result(state: DatasetState, planned: PlannedStep) -> Entry | None:
     return state.store.entry(planned.key) if planned.status == "current" else None
 
 
-def show_graph(project: Project) -> int:
-    """Print the stages in order, each with its inputs."""
-    pipeline = pipeline_of(project)
-    for name in pipeline.order():
-        stage = pipeline.stages[name]
-        over = f"per {stage.over}" if stage.over else "whole set"
-        remark = "   (only for sets that need it)" if stage.when else ""
-        remark = "   (only on request)" if stage.optional else remark
-        print(f"{name:<10} {over:<10} <- {', '.join(stage.inputs) or '(parameters only)'}{remark}")
-    return 0
-
-
-def show_logs(project: Project, request: Request) -> int:
-    """Print time, memory, warnings and versions of current results."""
-    state = read_state(project, request, look=True)
-    selected = [p for p in state.plan() if not request.targets or p.step.stage in request.targets]
-    if not selected:
-        raise InputError("the requested stages have no steps for this dataset", key="STAGE", cure="name other stages")
-    versions: dict[str, dict[str, None]] = {}
-    for p in selected:
-        if (entry := _result(state, p)) is None:
-            print(f"{p.step!s:<26} {p.status}: {summarize(p.reasons, MOST_REASONS)}")
-            continue
-        print(f"{p.step!s:<26} {_cost(entry.cost)}", *entry.warnings, sep="\n    warning: ")
-        machine = entry.cost["machine"]
-        made_with = {"Python": machine["python"], machine["system"]: machine["processor"]}
-        made_with |= {n.removeprefix("package:"): v for n, v in p.record.items() if n.startswith("package:")}
-        for name, version in made_with.items():
-            versions.setdefault(name, {})[version] = None
-    text = ", ".join(f"{name} {' or '.join(versions[name])}" for name in sorted(versions, key=str.lower))
-    print(textwrap.fill(f"made with {text}", 110, initial_indent="    ", subsequent_indent="    ") if versions else "")
-    return 0
-
-
-def _cost(cost: dict[str, Any]) -> str:
-    cores = f"{count(cost['threads'], 'thread')} on {count(cost['cores'], 'core')}"
-    numbers = f"{cost['seconds']:8.1f} s {cost['cpu_seconds']:8.1f} s processor {cost['memory_mb']:7.0f} MB peak"
-    return f"{numbers}   {cores}   {cost['started'][:16].replace('T', ' ')} UTC"
-
-
 def show_params(project: Project, stages: list[str] | None) -> int:
-    """Print every parameter of the stages, or of all, with default, range and meaning."""
+    """Print the parameters of the stages, or of all, as their source states them: default, range and meaning."""
     from factorlib.runner.worker import load_stage
 
     pipeline = pipeline_of(project)
     pipeline.check(stages or [])
     for name in stages or pipeline.order():
-        if others := pipeline.stages[name].params_of:
-            print(f"{name} takes the parameters of {', '.join(others)}")
-            continue
-        params = load_stage(StageCode(project.code_root, project.package, name, {}, project.pipeline_file)).Params
-        for param, values, default, text in parameters(params) or [("", "none", "", "It has no parameters.")]:
-            print(f"{name}.{param} = {default}    ({values})" if param else name)
-            print(textwrap.fill(text, 100, initial_indent="    ", subsequent_indent="    "))
+        params = load_stage(StageCode(project.root, project.package, name, {}, project.pipeline_file)).Params
+        inner = [f.type for f in msgspec.structs.fields(params) if isinstance(f.type, type)]
+        structs = [each for each in (*params.__mro__[:-1], *inner) if issubclass(each, msgspec.Struct)]
+        print(f"{name}:", *(inspect.getsource(each) for each in structs if each is not msgspec.Struct), sep="\n")
         for preset, settings in pipeline.stages[name].presets.items():
             print(f"{name}.preset={preset} stands for", *(f"{name}.{key}={value}" for key, value in settings.items()))
     return 0
@@ -351,63 +306,10 @@ def label_masks(project: Project, dataset: str, port: int) -> int:
     return 0
 
 
-def compare(project: Project, first: Path | None, second: Path | None) -> int:
-    """Write a page that compares two results, folders such as build/eames."""
-    if first is None or second is None:
-        cure = "make compare A=build/eames B=<another folder of results>"
-        raise InputError("two results must be named", key="compare", cure=cure)
-    pair = [ResultsFolder(path if path.is_dir() else project.build / path) for path in (first, second)]
-    for results, name in zip(pair, (first, second), strict=True):
-        if not results.keys_file.is_file():
-            known = [other.folder.name for other in all_results(project)]
-            cure = did_you_mean(str(name), known) if known else "make all DATASET=<name> makes one"
-            raise InputError("is not a folder of results", file=name, key="compare", cure=cure)
-    page = import_module("factorlib.report.comparison").comparison(
-        *(results.folder for results in pair), _changes(Store(project.store), *(results.keys() for results in pair))
-    )
-    path = project.build / "compare" / "-".join(results.folder.name for results in pair) / "index.html"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, page)
-    print(f"comparison: {project.short_path(path)}")
-    return 0
-
-
-def _changes(store: Store, first: dict[str, str], second: dict[str, str]) -> list[str] | None:
-    """List the differences of two results ({step: key}) in sources, parameters and data; None if one is unknown."""
-    changes = set()
-    for step in first.keys() & second.keys():
-        entries = store.entry(first[step]), store.entry(second[step])
-        if entries[0] is None or entries[1] is None:
-            return None
-        lines = difference(entries[0].record, entries[1].record)
-        changes |= {f"{step.partition('/')[0]}: {line}" for line in lines if not line.startswith("result of ")}
-    return sorted(changes)
-
-
-def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int:
-    """Pack a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
-    from factorlib.pack import write_pack
-
-    if not (folders := find_results(project, dataset)):
-        raise InputError(f"{dataset} has no results", key="DATASET", cure=project.command("all", dataset))
-    folder = folders[0].folder
-    out = out or Path(f"{folder.name}.zip")
-    files = write_pack(folder, out, replace)
-    print(f"{folder.name}: {files} files, {out.stat().st_size / 1e6:.1f} MB\n  {out}")
-    return 0
-
-
 # ── text ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 MOST_REASONS = 8  # reasons of one step on a line
 MOST_FAILED = 20  # names of failed steps
-BOUNDS = {
-    "minimum": "minimum",
-    "exclusiveMinimum": "above",
-    "maximum": "maximum",
-    "exclusiveMaximum": "below",
-    "minItems": "items",
-}
 
 
 def plan_lines(planned: list[PlannedStep], every_reason: bool = False) -> list[str]:
@@ -450,42 +352,3 @@ def count(items: Sized | int, unit: str = "step") -> str:
     """
     number = items if isinstance(items, int) else len(items)
     return f"{number} {unit}{'' if number == 1 else 's'}"
-
-
-def parameters(params: type) -> list[tuple[str, str, str, str]]:
-    """List the fields of a stage's `Params` in order: name, allowed values, default in YAML, meaning.
-
-    The meaning is the string that follows a field.  The fields of a struct in a field have dotted names.
-    """
-    texts: dict[str, str] = {}
-    table: list[tuple[str, str, str, str]] = []
-    for cls in reversed(params.__mro__):
-        if issubclass(cls, msgspec.Struct) and cls is not msgspec.Struct:
-            body = list(ast.iter_child_nodes(ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]))
-            for statement, following in zip(body, body[1:]):
-                match statement, following:
-                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(text)):
-                        texts[name] = " ".join(str(text).split())
-    (root,), schemas = msgspec.json.schema_components([params])
-    for name, schema in schemas[root["$ref"].rpartition("/")[2]]["properties"].items():
-        if "$ref" in schema:
-            inner = next(field.type for field in msgspec.structs.fields(params) if field.name == name)
-            table += [(f"{name}.{each}", *rest) for each, *rest in parameters(inner)]  # type: ignore[misc]
-        else:
-            default = msgspec.json.encode(schema.get("default")).decode().replace(",", ", ")
-            table.append((name, allowed(schema), default, texts.get(name, "")))
-    return table
-
-
-def allowed(schema: dict[str, Any]) -> str:
-    """Format the values that a JSON schema allows.
-
-    >>> allowed({"type": "integer"}), allowed({"type": "integer", "minimum": 1, "maximum": 1024})
-    ('integer', 'integer, minimum 1, maximum 1024')
-    >>> allowed({"anyOf": [{"enum": ["auto", "off"]}, {"type": "null"}]})
-    'auto, off or null'
-    """
-    if "anyOf" in schema:
-        return " or ".join(map(allowed, schema["anyOf"]))
-    bounds = [f"{words} {schema[word]}" for word, words in BOUNDS.items() if word in schema]
-    return ", ".join([*([schema["type"]] if "type" in schema else map(str, schema.get("enum", []))), *bounds])

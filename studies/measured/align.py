@@ -8,7 +8,6 @@ any of these.
     rough           500 triangles, warped by 3 %
     wrong mesh      the mesh of another shape
     wrong mask      a random blot where the object was
-    mirrored mask   left and right exchanged
     tiny mask       the object so far away that some 20 pixels show it
 """
 
@@ -40,7 +39,7 @@ FOCALS = (0.8, 2.5)  # of the width
 FILLS = (0.5, 0.9)
 TINY_FILL = 0.015  # bounding sphere's diameter in the image, of the height
 RIGHT_DEG = {"exact": 2.0, "rough": 6.0}  # a pose is right when its median normal error is no more
-WRONG = ("wrong mesh", "wrong mask", "mirrored mask", "tiny mask")
+WRONG = ("wrong mesh", "wrong mask", "tiny mask")
 SEEDS = 3
 JOBS = 2
 VIEWS = {"exact": 20, "rough": 4} | dict.fromkeys(WRONG, 1)  # photos of each shape and seed
@@ -64,8 +63,6 @@ def posed_photo(kind: str, shape: str, seed: int, number: int) -> PosedPhoto:
     camera, pose, label = random_photograph(bodies.photographed_mesh(shape), rng, fill)
     truth = rasterise(bodies.photographed_mesh(shape), camera, pose)
     mesh = bodies.rough_mesh(shape, seed) if kind == "rough" else bodies.photographed_mesh(shape)
-    if kind == "mirrored mask":
-        label = label[:, ::-1]
     if kind == "wrong mask":
         label = _blot(label, mesh.labels, rng)
     if kind == "wrong mesh":

@@ -64,18 +64,12 @@ def figure(recipe: Path) -> str:
     picture = sheet(files)
     picture.save(ROOT / "docs" / "gallery" / f"{recipe.stem}.jpg", quality=85, optimize=True)
     width, height = picture.size
-    caption = first[2:] + parts_of(folder, files)
+    caption = first[2:] + parts_of(files)
     return FIGURE.format(name=recipe.stem, caption=caption, width=width, height=height, dataset=DATASET)
 
 
-def parts_of(folder: Path, files: list[Path]) -> str:
-    """Name the rows and columns of a grid, or the lights of the pictures in `files`.
-
-    Frames and single pictures have no such names.
-    """
-    if (folder / "grid.txt").exists():
-        rows, columns = (folder / "grid.txt").read_text("utf-8").splitlines()[:2]
-        return f" R{rows[1:]}; {columns}."
+def parts_of(files: list[Path]) -> str:
+    """Name the lights of the pictures in `files`; frames and single pictures have no such names."""
     names = [file.stem for file in files]
     return "" if len(names) == 1 or names[0].isdigit() else f" Here, row by row: {', '.join(names)}."
 

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from factorlib.conventions import FRONT, half_of_normal_and_view
-from factorlib.generate.lobe_spheres import random_spheres, render_spheres
 from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED, write_layers
 from factorlib.reflection.paper_network import diffuse_inputs, specular_inputs
 from factorlib.reflection.samples import diffuse_samples, specular_samples
 from factorlib.reflection.training import Schedule, pixels_problem, trained_plainly
+from studies.measured.lobe_spheres import random_spheres, render_spheres
 from studies.measured.operator import diffuse_errors, specular_errors
 
 SPHERES = 4000

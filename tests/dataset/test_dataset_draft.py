@@ -1,7 +1,6 @@
 """`make new`: a dataset.yaml of folders of files, that says what it does not know instead of guessing."""
 
 import json
-import re
 import shutil
 
 import msgspec
@@ -15,7 +14,6 @@ from factorlib.dataset_draft import new_dataset
 from factorlib.labels.label_image import read_labels
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
-from tests.align.test_align import LAMP, TWINS, silhouette_of
 from tests.faults.sample import put
 from tests.refusal import refusal
 
@@ -176,52 +174,6 @@ def test_without_a_mesh_a_hull_by_structure_from_motion_is_written_and_that_is_s
     assert dataset.spec.cameras.sfm and dataset.spec.meshes["thing"].hull
     assert dataset.spec.meshes["thing"].parts == {"label_1": "label_1", "label_2": "label_2"}
     assert [[obj.mesh for obj in photo.objects] for photo in dataset.spec.photos] == [["thing"], ["thing"]]
-
-
-def drawn_chair(folder, *labels, solid=LAMP):
-    """Photos of a chair from several sides, with a mask each: labels of shell and legs."""
-    for path in [*(folder / "photos").iterdir(), *(folder / "meshes").iterdir()]:
-        path.unlink()
-    text = "".join("v {} {} {}\n".format(*vertex) for vertex in solid.vertices)
-    for label, part in ((1, "shell"), (2, "legs")):
-        faces = solid.faces[solid.face_label == label] + 1
-        text += f"g {part}\n" + "".join("f {} {} {}\n".format(*face) for face in faces)
-    (folder / "meshes" / "chair.obj").write_text(text)
-    for k, of in enumerate(labels):
-        label = silhouette_of(LAMP, of, k).label.astype(np.uint8)
-        Image.fromarray(label).save(folder / "masks" / f"p{k}.png")
-        Image.fromarray(np.repeat(label[..., None] * 50, 3, axis=-1)).save(folder / "photos" / f"p{k}.png")
-
-
-def test_parts_get_the_materials_that_silhouettes_tell_and_objects_those_that_differ(folder):
-    drawn_chair(folder, (1, 3), (1, 3), (2, 3))
-    missing, spec = made(folder)
-    assert spec["meshes"]["chair"]["parts"] == {"shell": "label_1", "legs": "label_3"}
-    assert [photo["objects"][0].get("materials") for photo in spec["photos"]] == [None, None, {"shell": "label_2"}]
-    assert "shell, legs" in missing[0] and len(missing) == 1
-    file = folder / "data" / "mine" / "dataset.yaml"
-    assert re.search(r"shell: label_1  # margin \d\.\d\d$", file.read_text(), re.MULTILINE)
-    assert Validation(read_dataset(file)).faults([("photo", None, {}, folder)]) == []
-    shutil.rmtree(folder / "data")
-    stripes = np.resize(np.array([1, 2, 3], np.uint8), (90, 120))  # of more materials than the chair has parts
-    Image.fromarray(stripes).save(folder / "masks" / "p2.png")
-    missing, spec = made(folder)
-    assert [photo["objects"][0].get("materials") for photo in spec["photos"]] == [
-        None,
-        None,
-        {"shell": "?", "legs": "?"},
-    ]
-    assert missing[0] == "photo p2: write which material shell of chair is made of"
-
-
-def test_what_silhouettes_do_not_tell_is_open_and_what_it_may_be_stands_beside_it(folder):
-    drawn_chair(folder, (1, 3), solid=TWINS)
-    mask = np.pad(np.repeat(np.uint8([[1, 3]]), 30, axis=1).repeat(30, axis=0), 30)
-    Image.fromarray(mask).save(folder / "masks" / "p0.png")
-    missing, spec = made(folder)
-    assert spec["meshes"]["chair"]["parts"] == {"shell": "?", "legs": "?"} and len(missing) == 2
-    file = folder / "data" / "mine" / "dataset.yaml"
-    assert re.search(r'shell: "\?"  # label_[13] or label_[13]$', file.read_text(), re.MULTILINE)
 
 
 def test_an_object_is_of_the_mesh_that_its_mask_names(folder):

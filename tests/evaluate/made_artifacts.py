@@ -158,14 +158,10 @@ def _photo(made: Made, folders: dict, photo: str, materials: list[str], light_va
     write_rgb_exr(folders["export"] / "illumination" / f"{photo}.exr", light_values * 1.1, LAT_LONG)
     again = _balls(seen, lambda m, n: ball(light, perturbed(TRUE[m], made.error), n))
     write_rgb_exr(folders["render"] / "resynthesis" / f"{photo}.exr", again)
-    for kind in ("materials", "reflectance_maps"):
-        (folders["render"] / kind / photo).mkdir(parents=True)
+    (folders["render"] / "materials" / photo).mkdir(parents=True)
     for name in materials:
         picture = _balls([name], lambda m, n: ball(light, perturbed(TRUE[m], made.error), n))
         write_rgb_exr(folders["render"] / "materials" / photo / f"{name}.exr", picture)
-        observed = ball_normals(SIZE)[1] & (name in seen) & (np.arange(SIZE) < 0.7 * SIZE)
-        channels = {c: picture[..., k] for k, c in enumerate("RGB")} | {"observed": observed}
-        write_exr(folders["render"] / "reflectance_maps" / photo / f"{name}.exr", channels)
 
 
 def lobes_of(seed: int) -> Lobes:

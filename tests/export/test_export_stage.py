@@ -16,18 +16,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.export import other_renderers
 from factorlib.export.gltf_writer import EXTENSION, gltf_material, read_parts_of_glb, write_glb
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge
-from factorlib.export.other_renderers import Angles, distribution
 from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import map_energy
-from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.reflection import reflection_operator
-from factorlib.reflection.brdf import ggx, specular
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, attach_errors, read_materials
 from factorlib.stage import silent
@@ -68,16 +64,15 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
             "exposures.json",
             "lights.json",
             "lobes.parquet",
-            "losses.json",
             "materials.json",
             "materials.mtlx",
         ),
         *("ball.glb", "egg.glb", "meshes/ball.ply", "meshes/egg.ply", "source/ball.obj", "source/egg.obj"),
         *("illumination/room_sky.exr", "illumination/room_suns.gltf"),
         *(f"illumination/{name}.{kind}" for name in ("front", "room") for kind in ("exr", "hdr")),
-        *(f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json", "usda")),
+        *(f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json")),
         *("scenes/blender.py", "scenes/light/front.exr", "scenes/light/room.exr"),
-        *(f"scenes/meshes/{name}.{kind}" for name in ("ball.red", "egg.red", "egg.brass") for kind in ("ply", "usda")),
+        *(f"scenes/meshes/{name}.ply" for name in ("ball.red", "egg.red", "egg.brass")),
     }
     assert first == second
 
@@ -97,11 +92,10 @@ def test_another_choice_of_materials_for_a_mesh_gets_its_own_files(inputs, tmp_p
         "objects": [{"name": "chair", "mesh": "egg", "materials": {"upper": "unseen", "lower": "unseen"}}]
     }
     out = run(msgspec.structs.replace(inputs, facts=facts), tmp_path / "out")
-    meshes = {f"{name}.{kind}" for name in ("egg.unseen", "egg.2.red", "egg.2.brass") for kind in ("ply", "usda")}
+    meshes = {f"{name}.ply" for name in ("egg.unseen", "egg.2.red", "egg.2.brass")}
     assert {p.name for p in (out / "scenes" / "meshes").iterdir()} == meshes
     assert "egg.unseen.ply" in (out / "scenes" / "front.xml").read_text()
     assert "egg.2.red.ply" in (out / "scenes" / "side.xml").read_text()
-    assert "@./meshes/egg.2.red.usda@" in (out / "scenes" / "side.usda").read_text()
 
 
 def test_a_coloured_exposure_has_a_map_of_its_own(inputs, tmp_path):
@@ -215,8 +209,8 @@ def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
         assert core["metallicFactor"] == 0
 
 
-def test_values_are_in_gltfs_ranges_and_viewers_without_the_extension_show_common_materials_alike():
-    """F0 rises steadily with k_s; plastics around an index of refraction of 1.5, and metals, differ by under a tenth."""
+def test_values_are_in_gltfs_ranges():
+    """F0 rises steadily with k_s."""
     rng, last = np.random.default_rng(0), 0.0
     for k_s in np.linspace(0.001, 0.09, 30):
         specular = gltf_material(Reflectance((0.5, 0.4, 0.3), (k_s,) * 3, 0.4))["extensions"][EXTENSION]
@@ -229,11 +223,6 @@ def test_values_are_in_gltfs_ranges_and_viewers_without_the_extension_show_commo
         values = [*core["baseColorFactor"], core["metallicFactor"], core["roughnessFactor"]]
         assert 0 <= min(values) and max(values) <= 1
         assert more is None or (0 <= 0.04 * max(more["specularColorFactor"]) <= 1 and 0 <= more["specularFactor"] <= 1)
-    plastics = [Reflectance((0.6, 0.3, 0.1), (k_s,) * 3, 0.4) for k_s in (0.045, 0.0533, 0.06)]
-    gold = Reflectance((0.05, 0.03, 0.01), (0.9, 0.7, 0.3), 0.3)
-    for material in (*plastics, gold):
-        shown = [other_renderers.ball_radiance(material, other_renderers.MODELS[n]) for n in ("glb", "glb_plain")]
-        assert np.linalg.norm(shown[1] - shown[0]) < 0.1 * np.linalg.norm(shown[0])
 
 
 def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
@@ -289,31 +278,3 @@ def read_tree(path) -> dict:
     """The JSON chunk of a GLB."""
     data = path.read_bytes()
     return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
-
-
-# ── What other programs show of the exported materials, against slow integrals and cases whose answer is known ──────
-
-
-GREY = Reflectance((0.4, 0.3, 0.2), (0.3, 0.3, 0.3), 0.6)
-
-
-def hemisphere(no: float, count: int = 600) -> tuple[Angles, float]:
-    """Angles of directions spread evenly over half the hemisphere, and their solid angle, doubled."""
-    ni, phi = (a.reshape(-1) for a in np.meshgrid(*2 * [(np.arange(count) + 0.5) / count]))
-    io = ni * no + np.sqrt((1 - ni**2) * (1 - no**2)) * np.cos(np.pi * phi)
-    oh = np.sqrt((1 + io) / 2)
-    return Angles(ni, np.full_like(ni, no), (ni + no) / (2 * oh), oh), 2 * np.pi / count**2
-
-
-def test_the_solved_model_is_the_operators():
-    angles, _ = hemisphere(0.7, 40)
-    product = distribution(GREY.alpha, angles.nh) * other_renderers.separable_smith(GREY.alpha, angles) * angles.ni
-    alpha, ni, no, nh = (torch.tensor(a, dtype=torch.float64) for a in (GREY.alpha, angles.ni, angles.no, angles.nh))
-    np.testing.assert_allclose(product, specular(alpha, ni, no, nh), rtol=1e-9)
-    np.testing.assert_allclose(distribution(GREY.alpha, angles.nh), ggx(alpha, nh), rtol=1e-9)
-    sky = Lobes(np.array([[0.0, 0.0, 1.0]]), np.array([1e-6]), np.ones((1, 3)))
-    normal, view = (torch.tensor([v], dtype=torch.float64) for v in ([0.0, 0.0, 1.0], [np.sqrt(1 - 0.49), 0.0, 0.7]))
-    expected = reflection_operator("reference")(sky, GREY, normal, view)
-    np.testing.assert_allclose(
-        other_renderers.integrate_sky(GREY, other_renderers.evaluate_solved_brdf, np.array([0.7])), expected, rtol=2e-3
-    )

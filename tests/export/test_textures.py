@@ -1,6 +1,5 @@
 """Image textures of painted meshes: the image at a vertex has the vertex's colour, in every format that refers to it."""
 
-import re
 import xml.etree.ElementTree as ET
 
 import msgspec
@@ -11,12 +10,10 @@ from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from factorlib.export import simplification
+from factorlib.export import texture_atlas
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import headroom_factor, paint_range
-from factorlib.export.simplification import MOST_ERROR, Surface, simplify
-from factorlib.export.texture_atlas import make_atlas
-from factorlib.images.picture import read_png
+from factorlib.export.texture_atlas import MOST_ERROR, Surface, make_atlas, simplify
 from factorlib.images.tone import srgb_decode
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh, smooth
@@ -111,8 +108,8 @@ def test_simplified_surfaces_are_near_and_keep_borders_of_materials_and_creases(
     x, y, z = ball.triangles_center.T
     label = np.where(z > 0.2 * np.sin(5 * np.arctan2(y, x)), 2, 1)
     mesh = smooth(np.asarray(ball.vertices), ball.faces, label)
-    assert simplify(mesh).faces is mesh.faces or len(mesh.faces) > simplification.MOST_TRIANGLES
-    monkeypatch.setattr(simplification, "MOST_TRIANGLES", 9000)
+    assert simplify(mesh).faces is mesh.faces or len(mesh.faces) > texture_atlas.MOST_TRIANGLES
+    monkeypatch.setattr(texture_atlas, "MOST_TRIANGLES", 9000)
     result = simplify(mesh)
     assert len(result.faces) <= 9000
     for a, b in ((mesh, result), (result, mesh)):
@@ -183,31 +180,18 @@ def test_painted_parts_have_images_and_the_others_the_bytes_of_plain_ones(folder
     files, plain = files_of(folder / "export"), files_of(exported[1])
     assert files == files_of(folder / "again")
     assert {"scenes/meshes/egg.png"} == {f for f in files if f.endswith(".png")}
-    for name in ("ball.glb", "meshes/ball.ply", "scenes/meshes/ball.red.ply", "scenes/meshes/ball.red.usda"):
+    for name in ("ball.glb", "meshes/ball.ply", "scenes/meshes/ball.red.ply"):
         assert files[name] == plain[name]
-    assert files["scenes/front.usda"] == plain["scenes/front.usda"]
 
 
 def test_every_format_looks_the_reflectance_up_in_the_same_image(folder):
     out = folder / "export"
     material = read_materials(out / "materials.json").materials["red"]
-    image = read_png(out / "scenes/meshes/egg.png")
-    # OpenUSD: st of the mesh, and the scale of the material
-    mesh, scene = ((out / "scenes" / name).read_text() for name in ("meshes/egg.red.usda", "side.usda"))
-    st, points = (
-        np.array(re.findall(r"-?[\d.e-]+", re.search(rf"{name} = \[(.*)\]", mesh)[1]), float).reshape(-1, size)
-        for name, size in (("primvars:st", 2), ("points", 3))
-    )
-    inner = points[:, 1] > 0.15  # beside the border the image goes over into brass
-    np.testing.assert_allclose(colours_at(image, st)[inner], (waves(points) * material.diffuse)[inner], atol=0.04)
-    assert "@./meshes/egg.png@" in scene and "displayColor" not in mesh + scene
-    scale = np.array(re.findall(r"[\d.]+", re.search(r"float4 inputs:scale = \((.*), 1.0\)", scene)[1]), float)
-    np.testing.assert_allclose(scale * (1 - np.array(material.specular)), 1)
     # glTF: a texture of the base colour
     part = trimesh.load(out / "egg.glb").geometry["red"]
     colours = colours_at(np.asarray(part.visual.material.baseColorTexture), part.visual.uv)
     base = waves(part.vertices) * material.diffuse / (1 - max(material.specular))
-    inner = part.vertices[:, 1] > 0.15
+    inner = part.vertices[:, 1] > 0.15  # beside the border the image goes over into brass
     np.testing.assert_allclose(colours[inner], base[inner], atol=0.06)
     # Blender: texture coordinates of the vertices, Mitsuba: colours
     heads = [

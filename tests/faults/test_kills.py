@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.results_folder import collect, verify
+from factorlib.runner.results_folder import verify
 from factorlib.runner.worker import _begin_process
 from tests.runner import toy
 from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
@@ -37,10 +37,6 @@ def write_text(self, text, *_):
             stream.flush()
             time.sleep({0})
 pathlib.Path.write_text = write_text
-if "gc" in sys.argv:
-    def slow(function):
-        return lambda *words, **more: (time.sleep(0.02), function(*words, **more))[1]
-    os.unlink, os.rmdir, os.rename = map(slow, (os.unlink, os.rmdir, os.rename))
 """
 PAUSE = 0.008  # seconds for a piece, where something is to happen meanwhile
 COMMAND = (  # `python -m factorlib` on the toy in the folder that is the first word
@@ -299,33 +295,6 @@ def test_a_folder_of_results_that_is_deleted_is_made_again(project):
         assert make(project) == 0 and is_sound(project) and results(project) == wanted, deleted
 
 
-# ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def test_gc_that_is_killed_leaves_what_is_current_and_is_finished_by_the_next(made_once, again):
-    project = again(made_once)
-    assert make(project, "table.scale=3", "upper.times=3") == 0 and make(project) == 0
-    keys = len(stored(project))
-    process = start(project, verb="gc")
-    assert wait_until(lambda: len([*(project.root / "build" / "store" / "keys").glob("*.json")]) < keys)
-    kill(process, "the run")
-    end(process)
-    assert len(stored(project)) > len(stored(made_once)), "it was to be killed before its end"
-    assert lost_in(project, results(made_once)) == []
-    collect(project)
-    assert sorted(stored(project)) == sorted(stored(made_once)) and not list((project.build / "store/tmp").glob("gc-*"))
-
-
-def test_gc_keeps_what_a_current_result_was_made_from(project):
-    """The table alone was made anew, with another scale: the total under the set's name was made from the old one."""
-    before = results(project)
-    assert make(project, "table.scale=3", targets=["table"]) == 0
-    collect(project)
-    assert set(state(project).values()) == {"current"} and new_runs(project) == [] and results(project) == before
-    collect(project)
-    assert set(state(project, settings=("table.scale=3",)).values()) - {"current"}, "what nothing needs goes"
-
-
 # ── damage in the store ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -370,7 +339,7 @@ def test_damage_under_the_same_size_and_time_is_found_by_verify_or_replaced_by_f
     if cure == "verify":
         assert not is_sound(project)
         text = capsys.readouterr().out
-        assert "total (set)" in text and "total.txt: other content" in text and "build/store/trees" in text
+        assert "total: " in text and "total.txt: other content" in text and "build/store/trees" in text
         assert new_runs(project) == ["total"]
     assert make(project, force=cure == "force") == 0 and results(project) == before and is_sound(project)
 

@@ -1,19 +1,17 @@
-"""Pixels: averaging down, transfer functions and tone curves, PNGs, halos of sharpening, and a lens's distortion."""
+"""Pixels: averaging down, transfer functions and tone curves, PNGs, and a lens's distortion."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter
 
 from factorlib.dataset.schema import Intrinsics
-from factorlib.images.colours import count_colours
-from factorlib.images.grain import add_grain, grain_covariance
 from factorlib.images.lens import Undistortion, radial_lens
 from factorlib.images.photo import Photo, box_mean
 from factorlib.images.picture import read_png, write_png
-from factorlib.images.processing import HALO, halo
 from factorlib.images.tone import by_log_exponent, curve, inverse, power_decode, slope, srgb_decode, srgb_encode
+from factorlib.labels.label_image import count_colours
+from factorlib.render.recipe_pictures import add_grain, grain_covariance
 from tests.refusal import refusal
 
 X = np.concatenate([[0.0, 1e-4], np.geomspace(0.01, 50, 40)])
@@ -70,46 +68,6 @@ def test_a_png_keeps_colours_under_alpha_and_has_no_date(tmp_path, channels):
     assert b"tIME" not in data and b"tEXt" not in data
     (tmp_path / "a.png").write_bytes(data[:8])
     refusal("a.png", read_png, tmp_path / "a.png")
-
-
-# ── Halos of sharpening are found about masks; blur, soft shadows and plain edges have none ─────────────────────────
-
-
-HEIGHT, WIDTH = 120, 160
-ROW, COLUMN = np.mgrid[:HEIGHT, :WIDTH]
-INSIDE = np.hypot(ROW - 60, COLUMN - 80) < 35
-KNOWN = np.ones((HEIGHT, WIDTH), bool)
-
-
-def picture(body, ground):
-    """Linear radiance of a disc that shades away to its rim, before a ground with a gradient, from a camera with a little blur."""
-    shaded = body * (1 - 0.4 * np.hypot(ROW - 60, COLUMN - 80) / 35)
-    return gaussian_filter(np.where(INSIDE, shaded, ground * (1 + COLUMN / WIDTH)), 0.7)
-
-
-def sharpened(linear, sigma, amount):
-    encoded = np.clip(linear, 0, 1) ** (1 / 2.2)
-    return np.clip(encoded + amount * (encoded - gaussian_filter(encoded, sigma)), 0, 1) ** 2.2
-
-
-def of(linear):
-    return halo(np.repeat(linear[..., None], 3, axis=-1), INSIDE, KNOWN)
-
-
-@pytest.mark.parametrize(("body", "ground"), [(0.6, 0.1), (0.08, 0.3)])
-def test_sharpening_is_seen_and_what_cameras_and_scenes_do_is_not(body, ground):
-    linear = picture(body, ground)
-    assert of(linear) < HALO / 2
-    assert of(sharpened(linear, 2.0, 1.0)) > HALO > of(gaussian_filter(linear, 1.5))
-    near = np.hypot(ROW - 60, COLUMN - 80) - 35
-    contact = linear * np.where(near > 0, 1 - 0.3 * np.exp(-np.abs(near) / 6) * (ROW > 60), 1)  # a shadow below
-    assert of(contact) < HALO
-
-
-def test_too_few_contours_and_pixels_that_are_left_out_say_nothing():
-    of_three = np.repeat(sharpened(picture(0.6, 0.1), 2.0, 1.0)[..., None], 3, axis=-1)
-    assert halo(of_three, INSIDE, INSIDE) == 0
-    assert halo(of_three, np.hypot(ROW - 60, COLUMN - 80) < 4, KNOWN) == 0
 
 
 # ── A lens's distortion is undone: against the picture that a pinhole takes of the same thing ───────────────────────

@@ -234,7 +234,7 @@ def test_rendered_spheres_are_what_the_reference_says(monkeypatch):
     """Nothing is assumed of frames, the map or Mitsuba's materials: mean errors within Monte Carlo noise of zero."""
     pytest.importorskip("mitsuba", reason="Mitsuba cannot run here, so that the training set is not checked")
     monkeypatch.setenv("FACTORLIB_MITSUBA", "scalar_rgb")  # the variant that runs everywhere
-    from factorlib.generate.lobe_spheres import Spheres, render_spheres
+    from studies.measured.lobe_spheres import Spheres, render_spheres
 
     axis = np.array([[0.6, -0.64, -0.48], [-0.8, 0.36, 0.48], [0.0, 0.28, -0.96], [0.28, 0.96, 0.0]])
     spheres = Spheres(axis, np.array([2.0, 30.0, 400.0, 6000.0]), np.array([0.9, 0.5, 0.3, 0.12]))

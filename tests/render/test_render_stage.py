@@ -16,7 +16,7 @@ from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
 from factorlib.render import resynthesis
-from factorlib.render.resynthesis import PointEffects, Reflector, interpolation_nodes, render_balls, resynthesise
+from factorlib.render.resynthesis import PointEffects, Reflector, interpolation_nodes, render_ball, resynthesise
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import silent
@@ -28,6 +28,8 @@ from tests.inference.made import observations_from_front
 from tests.integral import reflected
 from tests.runner.toy import files_of
 from tests.stages.made import ran
+
+FAST = render.Params(operator="closed_form", ball_size=33)
 
 
 @pytest.fixture
@@ -44,7 +46,7 @@ def run(inputs, photo, out):
 
 def test_pictures_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
     first, second = map(files_of, ([run(inputs, "side", tmp_path / name) for name in "ab"]))
-    stems = [f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES]
+    stems = [f"materials/side/{m}" for m in made_export.NAMES]
     assert set(first) == {f"{stem}.{suffix}" for stem in ["resynthesis/side", *stems] for suffix in ("exr", "png")}
     assert first == second
 
@@ -60,16 +62,11 @@ def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(
         np.testing.assert_allclose(read_rgb_exr(out / "materials" / photo / f"{name}.exr")[16, 16], expected, rtol=2e-3)
 
 
-def test_resynthesis_is_lit_inside_the_mask_alone_and_observed_normals_are_those_of_the_photo(inputs, tmp_path):
+def test_resynthesis_is_lit_inside_the_mask_alone(inputs, tmp_path):
     out = run(inputs, "front", tmp_path / "out")
     picture = read_rgb_exr(out / "resynthesis" / "front.exr")
     assert picture.shape == (made_export.HEIGHT, made_export.WIDTH, 3)
     np.testing.assert_array_equal(picture.max(-1) > 0, read_exr(inputs["masks"] / "front.exr")["label"] > 0)
-    folder = out / "reflectance_maps" / "front"
-    disc = np.hypot(*np.meshgrid(*[np.linspace(-1, 1, 32)] * 2)) < 0.9
-    assert read_exr(folder / "red.exr")["observed"][disc].mean() > 0.95  # the photo shows a whole ball of it
-    assert not read_exr(folder / "brass.exr")["observed"].any()
-    assert read_rgb_exr(folder / "brass.exr")[16, 16].min() > 0  # and yet it is synthesised
 
 
 def test_unknown_light_is_black_and_said(inputs, tmp_path, caplog):
@@ -186,7 +183,7 @@ def test_radiance_is_the_integral_over_the_exported_map():
 def test_balls_are_the_operator_at_every_pixel(roughness, sharpest):
     glossy = msgspec.structs.replace(GLOSSY, roughness=roughness)
     reflector = Reflector(reflection_operator("network"), cells(sharpest))
-    for picture in render_balls(reflector, glossy, (96, 48)):
+    for picture in (render_ball(reflector, glossy, size) for size in (96, 48)):
         normals, inside = ball_normals(len(picture))
         normals = normals * (1, -1, -1)
         expected = reflector(glossy, normals, np.broadcast_to(FRONT, normals.shape))

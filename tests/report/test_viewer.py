@@ -84,7 +84,7 @@ def test_under_a_plane_no_light_comes_from_above(tmp_path, open_):
     """The middle of the floor, or the upper side of its sheet, sees the disc's lower side within about 45° of the vertical, and the sky beside it."""
     white = TRUE["white"]
     write_glb(tmp_path / "two.glb", floor_and_plate(open_), ["red", "white"], {"red": white, "white": white})
-    packed, _ = viewer._mesh(trimesh.load_scene(tmp_path / "two.glb", process=False).geometry, np.ones(3), 1.0)
+    packed, _ = viewer._mesh(trimesh.load_scene(tmp_path / "two.glb", process=False).geometry, 1.0)
     sight, place = packed["sight"], numbers(packed["vertices"], "<u2", 3) / 32767.5 - 1
     normals, directions = numbers(packed["normals"], "<i2", 3) / 32767, numbers(sight["directions"], "<f4", 3)
     edges = [np.ptp(place[numbers(part, "<u4", 3)], axis=1).max() for part in packed["parts"]]

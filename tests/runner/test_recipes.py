@@ -1,7 +1,6 @@
 """A stage over recipes: a step for each that is asked for, its pictures under the recipe's name, and nothing else rerun for it."""
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -10,8 +9,7 @@ from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import Project, Provider, Recipe
-from factorlib.runner.results_folder import all_results, clean, collect
-from tests.refusal import refusal
+from factorlib.runner.results_folder import all_results, clean
 from tests.runner import toy
 from tests.runner.toy import write
 
@@ -85,7 +83,6 @@ def test_what_was_asked_for_before_stays_until_it_is_cleaned(project):
     assert make(project, "hello") == 0 and make(project, "bye") == 0
     assert said(project, "hello") and said(project, "bye") and to_run(project, "all") == []
     assert verbs.make(project, verbs.Request("set")) == 0  # without recipes
-    collect(project)
     assert said(project, "hello") and to_run(project, "all") == []
     clean(project, "set")
     assert all_results(project) == [] and not (project.build / "set").exists()
@@ -151,8 +148,3 @@ def test_a_recipe_that_is_not_there_or_can_have_no_folder_is_refused(project, tm
     with pytest.raises(InputError) as error:
         project.recipes(project.provider.read(project.root / "data" / "set"), [w.format(tmp_path) for w in words])
     assert wrong in str(error.value)
-
-
-def test_logs_of_a_stage_over_recipes_where_there_are_none_say_so(project):
-    shutil.rmtree(project.root / "recipes")
-    refusal("no steps for this dataset", verbs.show_logs, project, Request("set", ["shout"]))

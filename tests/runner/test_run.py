@@ -1,21 +1,19 @@
 """Real runs of a toy pipeline: what runs, what is kept, what is shown, what survives."""
 
 import fcntl
-import io
 import itertools
 import json
 import os
 import re
 import shutil
-import sys
 from functools import partial
 
 import pytest
 
 from factorlib.runner import display, verbs
-from factorlib.runner.plan import PlannedStep, Step, hash_of
+from factorlib.runner.plan import Step, hash_of
 from factorlib.runner.project import Pipeline, Stage, with_settings
-from factorlib.runner.results_folder import clean, collect, make_view, verify
+from factorlib.runner.results_folder import clean, make_view
 from factorlib.runner.run_folder import begin_run, end_run
 from factorlib.runner.store import MADE_FROM, Store, hash_of_file, is_locked, lock
 from tests.faults.test_kills import start, wait_until
@@ -95,14 +93,13 @@ def test_the_verdict_of_a_result_is_shown_and_only_when_asked_for_decides_the_ex
     assert verbs.make(project, verbs.Request("set", ["upper"]), strict=True) == 0  # not of the whole
 
 
-def test_plan_why_and_graph_show_the_same_plan(project, capsys):
+def test_plan_and_why_show_the_same_plan(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "Alphabet")
     for show, output in (
         (verbs.show_plan, "upper      to run  a                        file a.txt: changed"),
         (partial(verbs.show_plan, every_reason=True), "upper      to run  a\n    file a.txt: changed"),
     ):
         assert show(project, verbs.Request("set")) == 0 and output in capsys.readouterr().out
-    assert verbs.show_graph(project) == 0 and "total      whole set  <- count, table" in capsys.readouterr().out
 
 
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -201,30 +198,6 @@ def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
 # ── what is told ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_no_name_of_the_machine(project, capsys):
-    write(project.root / "data" / "set" / "a.txt", "odd")
-    edit(project, "stages/table.py", "import json", "import json, filelock")
-
-    def logs(*stages, settings=()):
-        assert verbs.show_logs(project, verbs.Request("set", list(stages) or None, list(settings))) == 0
-        return capsys.readouterr().out
-
-    assert make(project) == 0 and capsys.readouterr().err.count("a is odd") == 1
-    assert verbs.show_status(project, verbs.Request("set")) == 0 and "a is odd" in capsys.readouterr().out
-    output = logs()
-    for step, threads in (("upper/a", "1 thread"), ("count/b", "1 thread"), ("total", "2 threads")):
-        assert re.search("^" + step + COST.format(threads), output, re.M), output
-    versions = re.findall(r"^    made with filelock \d.*, Linux \w+, msgspec \d.*, Python 3\.\d.*$", output, re.M)
-    assert len(versions) == 1 and output.count("msgspec") == 1 and "    with " not in output
-    assert "warning: a is odd" in output
-    texts = [path.read_text() for path in (project.build / "store" / "keys").iterdir()]
-    assert not any(word in text for text in texts for word in (f'"{os.uname().nodename}"', str(project.root)))
-    steps = [line.split()[0] for line in logs("upper").splitlines() if not line.startswith(" ")]
-    assert steps == ["upper/a", "upper/b"]
-    output = logs("table", settings=["table.scale=3"])
-    assert re.search(r"^table +to run: parameter scale: default -> 3$", output, re.M)
-
-
 def test_a_run_ends_with_at_most_five_lines_of_warnings_each_of_one_fault():
     warnings = [
         (Step(f"stage{k}", photo), f"{photo} is odd by {n} %") for k in range(7) for n, photo in enumerate("xy")
@@ -243,44 +216,6 @@ def test_warnings_are_printed_at_the_end_of_any_run_and_before_the_error_of_thei
     assert capsys.readouterr().err.splitlines() == expected
 
 
-def test_a_terminal_shows_a_bar_for_each_stage_and_lines_above_them(monkeypatch):
-    terminal, steps = io.StringIO(), [Step("upper", "a"), Step("upper", "b")]
-    terminal.isatty = lambda: True
-    monkeypatch.setattr(sys, "stderr", terminal)
-    bars = display.Display()
-    bars.plan([PlannedStep(step, "to run", []) for step in steps])
-    for step in steps:
-        bars.start(step)
-    bars.progress(steps[0], 1, 2, "half\x1b[31m")
-    bars.report_once("warning: upper/b: odd\x1b[31m")
-    bars.finish(steps[1], 1.0)
-    bars.close()
-    output = terminal.getvalue()
-    assert "warning: upper/b: odd\\x1b[31m" in output and "1/2" in output and "50% half\\x1b[31m" in output
-
-
-def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alone(project, capsys):
-    assert make(project, "table.scale=3") == 0 and make(project) == 0
-    before = {stage: files_of(project.build / "set" / stage) for stage in ("upper", "count", "table", "total")}
-    for tree in (project.build / "store" / "trees").iterdir():
-        os.utime(tree, (1_700_000_000, 1_700_000_000))
-    capsys.readouterr()
-    assert collect(project, lambda: False) == 0
-    output = capsys.readouterr().out
-    assert re.search(r"^table +1 result .* MB   of 2023-11-1\d$", output, re.M) and re.search(
-        "^total +1 result ", output, re.M
-    )
-    assert "nothing was deleted" in output and state(project, settings=("table.scale=3",))["table"] == "current"
-    assert collect(project, lambda: True) == 0 and "deleted 2 results" in capsys.readouterr().out
-    assert {stage: files_of(project.build / "set" / stage) for stage in before} == before
-    assert set(state(project).values()) == {"current"}
-    assert state(project, settings=("table.scale=3",))["table"] == "to run"
-    assert collect(project, pytest.fail) == 0  # nothing is asked where there is nothing to free
-    assert clean(project, "set") == 0 and set(state(project).values()) == {"current"}
-    collect(project)
-    assert "current" not in state(project).values()
-
-
 # ── processes ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -291,7 +226,7 @@ def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsy
     assert wait_until(lambda: [*(project.build / "store" / "tmp").glob("run-*/upper-*/a.txt")]), "no step writes"
     verbs.show_status(project, verbs.Request("set"))
     assert re.search(r"^upper +[12] running", capsys.readouterr().out)
-    refusal("a run is using this store", collect, project)
+    refusal("a run is using this store", clean, project, "set")
     second = start(project)
     waits = any("another run is making it" in line for line in second.stdout)
     go.touch()
@@ -419,14 +354,11 @@ def test_what_one_checkout_makes_the_other_has(tmp_path, one, capsys):
     assert "all 6 steps are current" in capsys.readouterr().out
     assert make(other) == 0 and computed(other) == 0
     assert files_of(other.build / "set" / "total") == files_of(one.build / "set" / "total")
-    assert set(state(other).values()) == {"current"} and verify(other, None) == 0
-    verbs.show_logs(other, verbs.Request("set"))
     assert "MB peak" in capsys.readouterr().out, "what it cost is known here too"
 
 
-def test_neither_gc_nor_clean_deletes_what_others_need(tmp_path, one, shared):
+def test_clean_does_not_delete_what_others_need(tmp_path, one, shared):
     other, before = checkout(tmp_path / "other"), trees(shared)
-    refusal("other checkouts share this store", collect, other)
     assert make(other) == 0 and clean(other, None) == 0
     assert trees(shared) == before and not (other.build / "set").exists()
     assert new_runs(one) == []

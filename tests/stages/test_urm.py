@@ -4,10 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
-from factorlib.dataset.schema import ObjectsSlice
-from factorlib.export.mesh_files import MeshFiles
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
@@ -123,17 +120,3 @@ def test_objects_of_which_one_hovers_have_no_ground(two, height, stands):
     if ground is not None:
         np.testing.assert_allclose(ground.normal, [0, -1, 0], atol=1e-6)
         assert ground.point[1] == pytest.approx(0.5)
-
-
-def test_urm_and_export_place_a_scaled_mesh_alike(tmp_path, two):
-    """x_cam = R (s ∘ x) + t, whatever frame a vertex is in."""
-    turn, scale, shift = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix(), (1.0, 1.2, 0.8), (0.1, 0.2, 6.0)
-    entry = msgspec.convert({"rotation": turn.tolist(), "translation": shift, "scale": scale}, ObjectPose)
-    poses, given = dict.fromkeys(("left", "right"), entry), mesh_of([ball(1.0, 3)])
-    there = (given.vertices * scale) @ turn.T + shift
-    scaled = urm.read_meshes(two, poses)["left"]
-    assert np.allclose(entry.pose.apply(scaled.vertices).mean(0), there.mean(0), atol=1e-4)
-    (tmp_path / "meshes").mkdir()
-    own = msgspec.convert(two.facts["dataset.objects"], ObjectsSlice)
-    shape = MeshFiles(two, tmp_path, ["white"], 60.0, {}).shapes(own.objects[0], own.meshes, poses)[0]
-    assert np.allclose(given.vertices @ shape.cam_from_object[:3, :3].T + shape.cam_from_object[:3, 3], there)
