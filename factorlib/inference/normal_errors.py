@@ -15,11 +15,12 @@ Alone   A normal of confidence c (`factorlib.align.reliability`) is wrong by δn
 
 Poses   An object whose pose is wrong turns all its normals together.  Its light absorbs such an error, so that
         residuals do not show it.  The turn about each axis of each object in each photo is therefore an unknown η of
-        the light, in standard deviations POSE_DEVIATION, with the prior N(0, 1):
+        the light, in units of POSE_DEVIATION, with the prior N(0, v):
 
             y = y₀ + (∂y/∂η) η,        ∂y/∂η = POSE_DEVIATION · ∂y/∂n (axis × n).                                   (2)
 
-        It is fitted and integrated out with the light (`factorlib.inference.likelihood`).
+        It is fitted and integrated out with the light (`factorlib.inference.likelihood`).  v, one for all lights, is
+        estimated with T (`factorlib.inference.fit`), from 1 on.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Standard errors of materials and lights in a fixed gauge, including errors of the model.
 
-Materials   Let S be the materials' information with all lights eliminated.  Let s_k be the score of cluster k of
-            observations: its part of the gradient, less the part that the lights absorb.  Residuals are whitened and
-            divided by √T, so that for independent noise the covariance would be S⁻¹.  Too coarse cells, too few lobes
-            or wrong normals make neighbouring residuals correlated.  The sandwich
+Materials   Let S be the materials' information with all lights and turns of poses eliminated.  Let s_k be the score of
+            cluster k of observations: its part of the gradient, less the part that the lights absorb.  Residuals are
+            whitened and divided by √T, so that for independent noise the covariance would be S⁻¹.  Too coarse cells,
+            too few lobes or wrong normals make neighbouring residuals correlated.  The sandwich
 
                 S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                   (1)
 
@@ -48,7 +48,6 @@ from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.likelihood import (
-    LightLikelihood,
     System,
     cholesky_factor,
     cholesky_inverse,
@@ -79,7 +78,7 @@ ABSOLUTE = (
 )
 WIDTHS = (*[1.0] * REFLECTANCES, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
 # Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
-# roughness.  With them and turns of normals about 68 % of true values lie within one standard error on the sets that
+# roughness.  With them about 68 % of true values lie within one standard error on the sets that
 # settings were chosen on (`studies.measured.standard_errors`).
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.06])
 LIGHT_ERROR = 0.7
