@@ -11,7 +11,8 @@ from factorlib.inference.background import Background
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "inverse_sigma", "material", "photo", "held_out"),
-    *("visibility", "bounced", "confidence", "place", "row", "detail", "given_normal"),  # optional columns
+    *("visibility", "bounced", "confidence", "place", "row", "object"),
+    *("detail", "given_normal", "by_turns"),  # optional columns
 )
 LEAST_CONFIDENCE = 0.05  # of a normal: a smaller one counts as this
 CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
@@ -100,6 +101,9 @@ class Block(msgspec.Struct, frozen=True):
         ground: Patches of the ground, whose radiance is relative to what it would be without shadows; None without.
         detail: Factor on the diffuse reflectance of each observation's material, per channel; None for 1.
         given_normal: Normals of the mesh as given, where `normal` is another (`Observations.cell_normal`).
+        object: Number of the object in its photo; None if photos show one object each.
+        by_turns: ∂y/∂η of the radiance, channel by turn (`factorlib.inference.normal_errors`), in `unit`; None for sure
+            normals.
     """
 
     name: str
@@ -124,6 +128,8 @@ class Block(msgspec.Struct, frozen=True):
     ground: Block | None = None
     detail: Float[np.ndarray, "n 3"] | None = None
     given_normal: Float[np.ndarray, "n 3"] | None = None
+    object: Int[np.ndarray, " n"] | None = None
+    by_turns: Float[np.ndarray, "n 3 q"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -132,6 +138,11 @@ class Block(msgspec.Struct, frozen=True):
     def cell_normal(self) -> Float[np.ndarray, "n 3"]:
         """Normals of the mesh as given, which clusters are made of, like all cells (`Observations.cell_normal`)."""
         return self.normal if self.given_normal is None else self.given_normal
+
+    @property
+    def turns(self) -> int:
+        """Number q of unknown turns of normals."""
+        return 0 if self.by_turns is None else self.by_turns.shape[2]
 
     def take(self, rows: np.ndarray | slice) -> Block:
         """Return the observations `rows` (indices or a mask) alone."""

@@ -21,6 +21,7 @@ more to all observations: rims and thin parts show directions that nothing else 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import msgspec
@@ -62,10 +63,12 @@ class Hyperparameters(msgspec.Struct, frozen=True):
     Attributes:
         temperature: T of (1), which divides squared residuals.
         factors: s_k² of the prior: contrast of luminance and of colour relative to a typical light.
+        turn_variance: Variance of the turns η of poses (`factorlib.inference.normal_errors`), of all lights together.
     """
 
     temperature: float = START_TEMPERATURE
     factors: list[float] = msgspec.field(default_factory=lambda: [1.0, 1.0, 1.0])
+    turn_variance: float = 1.0
 
 
 class Fit(msgspec.Struct, frozen=True):
@@ -149,7 +152,10 @@ def fit_problem(
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
             solved = zip(state.likelihoods, state.systems, strict=True)
-            hyperparameters = list(problem.spread(lambda pair: estimate(*pair), list(solved)))
+            hyperparameters = share_turn_variance(
+                list(problem.spread(lambda pair: estimate(*pair), list(solved))),
+                [len(likelihood.light.turns) for likelihood in state.likelihoods],
+            )
             illuminations = [likelihood.illumination for likelihood in state.likelihoods]
             state = state._replace(likelihoods=list(map(with_table, illuminations, hyperparameters)))
         if schedule.materials_fixed:
@@ -208,7 +214,8 @@ def light_likelihood(
     if block.ground is not None and not light.fixed.any():
         ground = cast_shadows(block.ground, *arguments)
     tabulated = msgspec.structs.replace(illumination, table=table)
-    weights = mean, Q, log_determinant, hyperparameters.temperature
+    log_determinant -= len(light.turns) * float(np.log(hyperparameters.turn_variance))
+    weights = mean, Q, log_determinant, hyperparameters.temperature, hyperparameters.turn_variance
     return LightLikelihood(tabulated, prior, np.log(light.peaks), *weights, FIT_LOSS, ground)
 
 
@@ -227,7 +234,8 @@ def estimate_hyperparameters(
     cells, free = (np.flatnonzero(np.tile(mask, 3)) for mask in (~light.suns, light.free))
     # covariance of u: H⁻¹ of the free cells, 0 of the fixed ones, without suns
     covariance = np.zeros((3 * len(light), 3 * len(light)))
-    covariance[np.ix_(free, free)] = cholesky_inverse(system.factor[: len(free), : len(free)])
+    integrated = cholesky_inverse(system.factor[: light.integrated, : light.integrated])
+    covariance[np.ix_(free, free)] = integrated[: len(free), : len(free)]
     covariance = covariance[np.ix_(cells, cells)]
     factors = likelihood.prior.likeliest_factors(
         light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance
@@ -236,7 +244,17 @@ def estimate_hyperparameters(
         factor = min(factor, BACKGROUND_TEMPERATURE)
     residual = likelihood.illumination.residuals()
     temperature = estimate_temperature(likelihood.illumination.block, residual, least)
-    return Hyperparameters(factor * temperature, factors)
+    # a step of expectation maximisation: the mean of E[η²]
+    turns = slice(len(free), light.integrated)
+    variance = float(np.mean(light.turns**2 + np.diag(integrated)[turns])) if len(light.turns) else 1.0
+    return Hyperparameters(factor * temperature, factors, variance)
+
+
+def share_turn_variance(hyperparameters: Sequence[Hyperparameters], turns: Sequence[int]) -> list[Hyperparameters]:
+    """Return hyperparameters with one variance of turns, the mean over all lights' `turns`: a light has few."""
+    variances = [each.turn_variance for each in hyperparameters]
+    shared = float(np.average(variances, weights=turns)) if any(turns) else 1.0
+    return [msgspec.structs.replace(each, turn_variance=shared) for each in hyperparameters]
 
 
 def estimate_temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:

@@ -18,7 +18,7 @@ import torch
 from factorlib.checkpoint import Checkpoint
 from factorlib.inference.fit import Fit, FitSchedule, fit_problem
 from factorlib.inference.materials import MaterialErrors, Point
-from factorlib.inference.normal_errors import scale_weights
+from factorlib.inference.normal_errors import NormalErrors, apply_errors
 from factorlib.inference.problem import JointProblem
 from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.results.materials import Decision
@@ -88,8 +88,7 @@ class SolveState(msgspec.Struct, frozen=True):
         suns: Decision on each light's sun.
         observations: Largest number of a light's observations that materials are fitted to.
         errors: Standard errors of the materials of `fit`; empty before they are estimated.
-        light_factors: Factors of `factorlib.inference.normal_errors` on 1/σ of the observations that lights are fitted
-            to; empty before these fits.
+        light_errors: Errors of normals of the observations that lights are fitted to; empty before these fits.
     """
 
     fit: Fit
@@ -104,7 +103,7 @@ class SolveState(msgspec.Struct, frozen=True):
     suns: list[Decision] = []
     observations: int = 0
     errors: MaterialErrors = MaterialErrors()
-    light_factors: list[np.ndarray] = []
+    light_errors: list[NormalErrors] = []
 
     @property
     def light_observations(self) -> int:
@@ -124,7 +123,7 @@ class SolveState(msgspec.Struct, frozen=True):
     def light_sample(self, problem: JointProblem, seed: int) -> JointProblem:
         """Return the observations that lights are fitted to with the materials fixed, under the chosen effects."""
         sample = self.effective_problem(problem).subsample(self.light_observations, seed)
-        return scale_weights(sample, self.light_factors) if self.light_factors else sample
+        return apply_errors(sample, self.light_errors) if self.light_errors else sample
 
 
 class Solution(SolveState, frozen=True, kw_only=True):

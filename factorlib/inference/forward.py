@@ -1,7 +1,7 @@
 """Forward model of one illumination: predicted radiance of its photos, residuals and all derivatives.
 
     linear     ℓ_ic = k_d,c (e_i Σ_p D_ip w_pc + G_d,ic) + k_s,c (e_i Σ_p S_ip w_pc + G_s,ic),   w_p = peak_p exp(u_p)
-    predicted  y_ic = τ_i(ℓ_ic), τ the photo's tone curve
+    predicted  y_ic = τ_i(ℓ_ic) + (∂y/∂η)_ic η, τ the photo's tone curve, η turns of normals
     residual   r_ic = (y_ic − radiance_ic) / σ_ic
 
 A clipped channel has the residual min(r_ic, 0), because its true radiance may be higher.  D and S are the responses of
@@ -77,8 +77,8 @@ class Linearised(NamedTuple):
         specular: Specular part of ∂r/∂u.
         by_roughness: ∂²r/∂u ∂roughness.
         by_material: ∂r with respect to log k_d, log k_s and roughness.
-        by_photo: ∂r with respect to the free log exposures, the log tone exponents and, where it is free, the log of
-            the factor on fixed cells.  The first photo's exposure is fixed.
+        by_photo: ∂r with respect to turns of normals, the free log exposures, the log tone exponents and, where it is
+            free, the log of the factor on fixed cells.  The first photo's exposure is fixed.
         residual: r.
     """
 
@@ -155,8 +155,8 @@ class Illumination(msgspec.Struct, frozen=True):
             specular = specular + block.bounced[:, 3:]
         # ℓ and y
         linear = self.materials.diffuse[block.material] * diffuse + self.materials.specular[block.material] * specular
-        toned = self.light.apply_tone(linear, block.photo)
-        return Prediction(diffuse, specular, by_roughness, linear, toned, responses)
+        radiance = self.light.apply_tone(linear, block.photo) + self.turned
+        return Prediction(diffuse, specular, by_roughness, linear, radiance, responses)
 
     def radiance(self) -> Float[np.ndarray, "n 3"]:
         """Return y, the predicted radiance of every observation."""
@@ -263,7 +263,7 @@ class Illumination(msgspec.Struct, frozen=True):
         value = self.fitted_loss(residual, loss) / temperature
         # a = ½ ∂(Σ ρ/T)/∂ℓ; `lit` is the part of ℓ that is proportional to the light
         by_radiance = self.root_weights(residual, loss, temperature) ** 2 * residual * block.inverse_sigma
-        by_linear = by_radiance * light.tone_slope(prediction.radiance, block.photo)
+        by_linear = by_radiance * light.tone_slope(prediction.radiance - self.turned, block.photo)
         from_light = prediction.linear - self.bounced
         # Σ a ∂ℓ/∂(log k_d, log k_s, roughness), and Dᵀ a e k_d + Sᵀ a e k_s with respect to w
         by_materials = np.zeros((len(self.materials), UNKNOWNS))
@@ -278,16 +278,25 @@ class Illumination(msgspec.Struct, frozen=True):
             by_materials[m, 6] = float((ks * a * prediction.by_roughness[rows]).sum())
             lit = a * self.exposure[rows]
             by_weight += lookup.by_weight(lit * kd * detail[rows], lit * ks)
-        # gradient by log radiance of free cells, log exposures, log tone exponents and the log factor on fixed cells
+        # gradient by log radiance of free cells, turns, log exposures, log tone exponents and the log factor on fixed
+        # cells
         by_cells = by_weight * light.weight
+        parts = [by_cells[light.free].T.reshape(-1)]
+        if block.by_turns is not None:
+            parts.append(np.tensordot(by_radiance, block.by_turns))
         by_photo = np.bincount(block.photo, (by_linear * from_light).sum(1), len(light.log_exposure))
-        parts = [by_cells[light.free].T.reshape(-1), by_photo[len(by_photo) - light.free_exposures :]]
+        parts.append(by_photo[len(by_photo) - light.free_exposures :])
         if len(light.log_tone):
             by_tone = by_radiance * by_log_exponent(np.maximum(prediction.linear, 0), light.exponents(block.photo))
             parts.append(np.bincount(block.photo, by_tone.sum(1), len(light.log_tone)))
         if light.scale_free:
             parts.append(by_cells[~light.free].sum(keepdims=True).reshape(1))
         return Gradient(value, by_materials, np.concatenate(parts))
+
+    @property
+    def turned(self) -> Float[np.ndarray, "n 3"] | float:
+        """Change of the radiance y by turns of normals."""
+        return 0.0 if self.block.by_turns is None else self.block.by_turns @ self.light.turns
 
     @property
     def bounced(self) -> Float[np.ndarray, "n 3"] | float:
@@ -313,7 +322,7 @@ class Illumination(msgspec.Struct, frozen=True):
         residual = self.block.residuals(prediction.radiance)
         pull = self.root_weights(residual, loss, temperature)
         scale = pull * self.block.inverse_sigma
-        rising = scale * light.tone_slope(prediction.radiance, self.block.photo)  # ∂r/∂ℓ
+        rising = scale * light.tone_slope(prediction.radiance - self.turned, self.block.photo)  # ∂r/∂ℓ
         by_photos = self._by_photos(prediction, scale, rising)
         free = light.free if light.fixed.any() else slice(None)
         detail = self.detail.astype(np.float32)
@@ -348,7 +357,7 @@ class Illumination(msgspec.Struct, frozen=True):
     def _by_photos(
         self, prediction: Prediction, scale: Float[np.ndarray, "n 3"], rising: Float[np.ndarray, "n 3"]
     ) -> list[Float[np.ndarray, "n q"]]:
-        """Return ∂r/∂log e = τ' (ℓ − bounced)/σ and ∂r/∂log g of each channel, by the photos' exposures and exponents.
+        """Return ∂r/∂η, ∂r/∂log e = τ' (ℓ − bounced)/σ and ∂r/∂log g of each channel.
 
         Args:
             prediction: Prediction of this illumination.
@@ -360,6 +369,9 @@ class Illumination(msgspec.Struct, frozen=True):
         by_exposure = (prediction.linear - self.bounced) * rising
         free = photos[:, len(light.log_exposure) - light.free_exposures :]
         columns = [free * by_exposure[:, c, None] for c in range(3)]
+        if self.block.by_turns is not None:
+            by_turns = scale[:, :, None] * self.block.by_turns
+            columns = [np.hstack([by_turns[:, c], column]) for c, column in enumerate(columns)]
         if len(light.log_tone):
             by_tone = scale * by_log_exponent(np.maximum(prediction.linear, 0), light.exponents(self.block.photo))
             columns = [np.hstack([column, photos * by_tone[:, c, None]]) for c, column in enumerate(columns)]

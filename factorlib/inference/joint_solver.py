@@ -39,7 +39,7 @@ from factorlib.inference.model_selection import (
     select_grounds,
     select_tone_curves,
 )
-from factorlib.inference.normal_errors import normal_error_factors, with_normal_errors
+from factorlib.inference.normal_errors import normal_errors, with_normal_errors
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.splitting import split_cells
@@ -214,8 +214,8 @@ def apply_prior(request: SolveRequest, state: SolveState) -> SolveState:
 
 def fit_lights(request: SolveRequest, state: SolveState) -> SolveState:
     """Fit the lights to observations of any confidence, with the materials fixed."""
-    factors = normal_error_factors(request.light_problem(state), state.fit.point)
-    state = msgspec.structs.replace(state, light_factors=factors)
+    errors = normal_errors(request.light_problem(state), state.fit.point)
+    state = msgspec.structs.replace(state, light_errors=errors)
     fit = request.run.fit("lights", request.light_problem(state), state.fit, LIGHTS)
     return msgspec.structs.replace(state, fit=fit)
 

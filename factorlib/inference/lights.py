@@ -73,6 +73,7 @@ class Light(msgspec.Struct, frozen=True):
         fixed: Mask of the cells of known radiance (`factorlib.inference.known`); empty for none.
         scale_free: True if the radiance of these cells is known up to one factor.
         exposures_fixed: True if the exposures are known.
+        turns: η, turns of normals in standard deviations (`factorlib.inference.normal_errors`); empty for sure normals.
     """
 
     axis: Float[np.ndarray, "p 3"]  # unit, in the illumination's frame
@@ -84,6 +85,7 @@ class Light(msgspec.Struct, frozen=True):
     fixed: Bool[np.ndarray, " p"] = msgspec.field(default_factory=lambda: np.zeros(0, bool))
     scale_free: bool = False
     exposures_fixed: bool = False
+    turns: Float[np.ndarray, " q"] = msgspec.field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.log_sharpness)
@@ -152,10 +154,15 @@ class Light(msgspec.Struct, frozen=True):
     def unknowns(self) -> int:
         """Number of a step's unknowns.
 
-        They are log radiances of free cells, free exposures, tone exponents, and the factor on fixed cells where it is
-        free.
+        They are log radiances of free cells, turns of normals, free exposures, tone exponents, and the factor on fixed
+        cells where it is free.
         """
-        return 3 * int(self.free.sum()) + self.free_exposures + len(self.log_tone) + self.scale_free
+        return self.integrated + self.free_exposures + len(self.log_tone) + self.scale_free
+
+    @property
+    def integrated(self) -> int:
+        """Number of the unknowns that Laplace's approximation integrates out, the first ones: cells and turns."""
+        return 3 * int(self.free.sum()) + len(self.turns)
 
     @property
     def free_exposures(self) -> int:
@@ -165,6 +172,10 @@ class Light(msgspec.Struct, frozen=True):
     def with_log_radiance(self, u: Float[np.ndarray, "3 p"]) -> Light:
         """Return the same cells with log radiance `u`."""
         return msgspec.structs.replace(self, weight=(self.peaks * np.exp(u)).T)
+
+    def with_turns(self, count: int) -> Light:
+        """Return the light with this number of turns, which are 0 if it had another number."""
+        return self if len(self.turns) == count else msgspec.structs.replace(self, turns=np.zeros(count))
 
     def with_lobes(self, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:
         """Return the light with q more lobes, which come last."""

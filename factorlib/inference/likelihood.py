@@ -62,19 +62,6 @@ EXPOSURE_DEVIATION = 0.35
 TONE_DEVIATION = 0.3  # standard deviation of a log tone exponent
 
 
-class Grouping(NamedTuple):
-    """Groups of observations, and a change of their residuals.
-
-    Attributes:
-        group: Number of each observation's group, from 0.
-        change: Change of the residuals, whitened, weighted by the robust loss and divided by √T; None for the residuals
-            themselves.
-    """
-
-    group: Int[np.ndarray, " n"]
-    change: Float[np.ndarray, "n 3"] | None = None
-
-
 class System(NamedTuple):
     """Contribution of one illumination to the objective, half its gradient and half its Gauss–Newton Hessian.
 
@@ -93,8 +80,8 @@ class System(NamedTuple):
         determinant_by_materials: Half the gradient of log det H with respect to materials.
         determinant_hessian: Half its Hessian with respect to materials.
         determinant_by_light: Half the gradient of log det H with respect to the light; it acts on materials only.
-        scores: For each requested grouping of the observations, their contributions to the gradient, materials then
-            light, one row a group.
+        scores: Contributions of requested groups of observations to the gradient, materials then light, one row a
+            group.
     """
 
     value: float
@@ -109,7 +96,7 @@ class System(NamedTuple):
     determinant_by_materials: Float[np.ndarray, " k"]
     determinant_hessian: Float[np.ndarray, "k k"]
     determinant_by_light: Float[np.ndarray, " l"]
-    scores: tuple[Float[np.ndarray, "g k+l"], ...] = ()
+    scores: Float[np.ndarray, "g k+l"]
 
 
 class LightLikelihood(msgspec.Struct, frozen=True):
@@ -123,6 +110,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         precision: Q, likewise.
         log_determinant: log det Q of the free cells and suns.
         temperature: T, which divides squared residuals.
+        turn_variance: Variance of the turns η of poses.
         loss: Robust loss ρ.
         ground: Shadows on the ground; None without.
     """
@@ -134,6 +122,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
     precision: Float[np.ndarray, "3p 3p"]
     log_determinant: float
     temperature: float
+    turn_variance: float
     loss: RobustLoss
     ground: CastShadows | None = None
 
@@ -165,12 +154,12 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             slope[: by_cells.size] += by_cells.T.reshape(-1)
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
-    def normal_equations(self, determinants: bool = True, groupings: Sequence[Grouping] = ()) -> System:
+    def normal_equations(self, determinants: bool = True, group: Int[np.ndarray, " n"] | None = None) -> System:
         """Return the value of (1) and its normal equations.
 
         Args:
             determinants: False for φ instead of (1), without the determinants and their costly derivatives.
-            groupings: Groups of observations, for `System.scores`.
+            group: Number of each observation's group, from 0, for `System.scores`; None for no scores.
         """
         illumination = self.illumination
         prediction = illumination.predict()
@@ -209,7 +198,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         if determinants:
             value += self._determinants(factor)
             determinant = _determinant_derivatives(parts, factor, places, illumination)
-        scores = tuple(_scores(parts, grouping, places, size) for grouping in groupings)
+        scores = np.zeros((0, k + size)) if group is None else _scores(parts, group, places, size)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
     def marginal(self, system: System) -> float:
@@ -218,8 +207,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 
     def _determinants(self, factor: Float[np.ndarray, "l l"]) -> float:
         """Return log det H − log det Q."""
-        p = 3 * int(self.light.free.sum())
-        return 2 * float(np.log(np.diag(factor)[:p]).sum()) - self.log_determinant
+        return 2 * float(np.log(np.diag(factor)[: self.light.integrated]).sum()) - self.log_determinant
 
     def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
         """Return (u − m)ᵀQ(u − m) plus the Gaussian priors of exposures and tones, and half the gradient."""
@@ -258,33 +246,31 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         return self.ground.gradient(self.light.weight, self.loss, self.temperature)[0]
 
     def _photo_unknowns(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
-        """Return the free log exposures and log tone exponents, and their standard deviations."""
+        """Return turns, free log exposures and log tone exponents, and their standard deviations."""
         light = self.light
-        values = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
-        return np.concatenate(values), np.repeat(
-            [EXPOSURE_DEVIATION, TONE_DEVIATION], [light.free_exposures, len(light.log_tone)]
-        )
+        exposures = light.log_exposure[len(light.log_exposure) - light.free_exposures :]
+        values = light.turns, exposures, light.log_tone
+        deviations = float(np.sqrt(self.turn_variance)), EXPOSURE_DEVIATION, TONE_DEVIATION
+        return np.concatenate(values), np.repeat(deviations, list(map(len, values)))
 
 
 def _scores(
-    parts: Sequence[Linearised], grouping: Grouping, places: Int[np.ndarray, " k"], size: int
+    parts: Sequence[Linearised], group: Int[np.ndarray, " n"], places: Int[np.ndarray, " k"], size: int
 ) -> Float[np.ndarray, "g k+l"]:
-    """Return the sum over each group of every derivative times its residual, or times a change of it.
+    """Return the sum over each group of every derivative times its residual.
 
     Args:
         parts: All channels and materials of a light.
-        grouping: Groups of observations.
+        group: Number of each observation's group.
         places: Numbers of the materials' unknowns.
         size: l, number of the light's unknowns.
     """
     k = len(places)
-    group, change = grouping
     scores = np.zeros((int(group.max(initial=-1)) + 1, k + size))
     for part in parts:
         p = part.diffuse.shape[1]
         start = k + part.channel * p
-        residual = part.residual if change is None else change[part.rows, part.channel]
-        summing = (group[part.rows] == np.arange(len(scores))[:, None]) * residual
+        summing = (group[part.rows] == np.arange(len(scores))[:, None]) * part.residual
         scores[:, np.searchsorted(places, part.places)] += summing @ part.by_material
         scores[:, start : start + p] += summing @ (part.diffuse + part.specular)
         scores[:, k + 3 * p :] += summing @ part.by_photo
@@ -308,7 +294,8 @@ def _determinant_derivatives(
     k = len(places)
     light = illumination.light
     p = int(light.free.sum())
-    covariance = cholesky_inverse(factor[: 3 * p, : 3 * p])  # Σ of u
+    integrated = light.integrated
+    covariance = cholesky_inverse(factor[:integrated, :integrated])  # Σ of u and η
     by_materials = np.zeros(k)
     by_materials_twice = np.zeros((k, k))
     by_light = np.zeros(light.unknowns)
@@ -317,11 +304,12 @@ def _determinant_derivatives(
         cells = slice(part.channel * p, (part.channel + 1) * p)
         rows = np.searchsorted(places, part.places)
         Σ = covariance[cells, cells].astype(np.float32)
+        by_turns = part.by_photo[:, : len(light.turns)]
         # ∂J by log k_d, log k_s and roughness; the first two are the two parts of J
         slopes = (part.diffuse, part.specular, part.by_roughness)
         J = part.diffuse + part.specular
         # Σ_i J_i Σ ∂J_iᵀ and Σ_i (J_i Σ)_j J_ij, (2)
-        JΣ = J @ Σ
+        JΣ = J @ Σ + by_turns @ covariance[3 * p :, cells].astype(np.float32)
         by_materials[rows] += [float(np.vdot(JΣ, slope)) for slope in slopes]
         by_cell = JΣ * J
         by_light[cells] += by_cell.sum(0)
@@ -332,7 +320,7 @@ def _determinant_derivatives(
         stride = len(J) / max(len(sparse[0]), 1)
         hessian = np.array([[float(np.vdot(a @ Σ, b)) for b in sparse] for a in sparse])
         by_materials_twice[np.ix_(rows, rows)] += stride * hessian
-    free_exposures = slice(3 * p, 3 * p + light.free_exposures)
+    free_exposures = slice(integrated, integrated + light.free_exposures)
     by_light[free_exposures] = by_exposure[len(by_exposure) - light.free_exposures :]
     return by_materials, by_materials_twice, by_light
 

@@ -3,7 +3,7 @@
 A fit weighs observations as if the model were exact but for independent noise, so that a wrong mesh can outweigh any
 prior: stone becomes enamel.  Once the errors of the model are known (`factorlib.inference.uncertainty`), each material
 is estimated again.  Let θ = (log k_d, log k_s, roughness), θ̂ the fit, A⁻¹ its covariance as the fit weighs its
-observations, and M that of errors of normals and of the model.  p is the mixture of classes of
+observations, and M that of errors of the model.  p is the mixture of classes of
 `factorlib.inference.material_prior`.  θ minimises
 
     (θ − θ₀)ᵀ (A⁻¹ + M)⁻¹ (θ − θ₀) − 2 log p(log k_s, roughness),    θ₀ = θ̂ + A⁻¹ g                                 (1)

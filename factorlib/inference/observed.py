@@ -205,6 +205,7 @@ def _block(
         sure,
         None if observations.place is None else _rotate(observations.place, observations, turned), rows[order],
         given_normal=None if observations.given_normal is None else given_normal,
+        object=observations.object,
     )  # fmt: skip
     if observations.detail is None or (observations.detail == 1).all():
         return block

@@ -373,15 +373,15 @@ def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (ar
 def light_limits(light: Light) -> Float[np.ndarray, "2 l"]:
     """Return lower and upper limits of a step of a light's unknowns: tone exponents stay within their range."""
     limits = np.tile([[-np.inf], [np.inf]], light.unknowns)
-    first = 3 * int(light.free.sum()) + light.free_exposures
+    first = light.integrated + light.free_exposures
     limits[:, first : first + len(light.log_tone)] = np.log(TONE_RANGE)[:, None] - light.log_tone
     return limits
 
 
 def step_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     """Return the light after a step of its unknowns."""
-    counts = 3 * int(light.free.sum()), light.free_exposures, len(light.log_tone)
-    cells, exposures, tones, scale = np.split(step, np.cumsum(counts))
+    counts = 3 * int(light.free.sum()), len(light.turns), light.free_exposures, len(light.log_tone)
+    cells, turns, exposures, tones, scale = np.split(step, np.cumsum(counts))
     brighter = np.ones((len(light), 3))
     brighter[light.free] = np.exp(cells.reshape(3, -1).T)
     brighter[~light.free] = np.exp(scale.sum())
@@ -389,6 +389,7 @@ def step_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     return msgspec.structs.replace(
         light,
         weight=light.weight * brighter,
+        turns=light.turns + turns,
         log_exposure=light.log_exposure + exposures,
         log_tone=light.log_tone + tones,
     )

@@ -51,7 +51,7 @@ class JointProblem(msgspec.Struct, frozen=True):
             ValueError: If there is not one light per block.
         """
         return [
-            Illumination(b, light, point.materials, self.operator)
+            Illumination(b, light.with_turns(b.turns), point.materials, self.operator)
             for b, light in zip(self.blocks, point.lights, strict=True)
         ]
 

@@ -1,9 +1,9 @@
 """Standard errors of materials and lights in a fixed gauge, including errors of the model.
 
-Materials   Let S be the materials' information with all lights eliminated.  Let s_k be the score of cluster k of
-            observations: its part of the gradient, less the part that the lights absorb.  Residuals are whitened and
-            divided by √T, so that for independent noise the covariance would be S⁻¹.  Too coarse cells, too few lobes
-            or wrong normals make neighbouring residuals correlated.  The sandwich
+Materials   Let S be the materials' information with all lights and turns of poses eliminated.  Let s_k be the score of
+            cluster k of observations: its part of the gradient, less the part that the lights absorb.  Residuals are
+            whitened and divided by √T, so that for independent noise the covariance would be S⁻¹.  Too coarse cells,
+            too few lobes or wrong normals make neighbouring residuals correlated.  The sandwich
 
                 S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                   (1)
 
@@ -21,13 +21,6 @@ Gauge       The data leave one factor per channel and component free, so an erro
 
 Variables   S comes from the system of φ (`factorlib.inference.likelihood`), with respect to reflectances: with respect
             to their logarithms, a zero reflectance would look exactly known.
-
-Normals     On thin and coarse parts normals are wrong together, which residuals do not show: lights and roughness
-            explain them.  Let the normals of one material in one photo turn by their deviation s, (1) of
-            `factorlib.inference.normal_errors`, about each axis, all together.  Let d_k be the change of the score by
-            turn k, less the part that the lights absorb.  Materials then have the further covariance
-
-                S⁻¹ (Σ_k d_k d_kᵀ) S⁻¹                                                                               (2)
 
 Model       More observations do not remove errors of the model itself, mostly of the mesh.  MODEL_ERROR is therefore
             added in quadrature, in proportion to the residuals.
@@ -55,8 +48,6 @@ from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.likelihood import (
-    Grouping,
-    LightLikelihood,
     System,
     cholesky_factor,
     cholesky_inverse,
@@ -73,7 +64,6 @@ from factorlib.inference.materials import (
     Materials,
     Point,
 )
-from factorlib.inference.normal_errors import normal_deviation
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
@@ -88,7 +78,7 @@ ABSOLUTE = (
 )
 WIDTHS = (*[1.0] * REFLECTANCES, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
 # Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
-# roughness.  With them and turns of normals about 68 % of true values lie within one standard error on the sets that
+# roughness.  With them about 68 % of true values lie within one standard error on the sets that
 # settings were chosen on (`studies.measured.standard_errors`).
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.06])
 LIGHT_ERROR = 0.7
@@ -148,42 +138,36 @@ class Posterior:
         def system(pair: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
             likelihood = light_likelihood(*pair, self.prior, not with_scores, self.problem.tables)
-            groupings = []
-            if with_scores:
-                groupings = [Grouping(pair[0].block.clusters()), *normal_turns(likelihood)]
-            result = likelihood.normal_equations(determinants=False, groupings=groupings)
+            group = pair[0].block.clusters() if with_scores else None
+            result = likelihood.normal_equations(determinants=False, group=group)
             self.tick()
             return result
 
         illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
-    def covariances(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]:
-        """Return three covariances of reflectances and roughnesses, in the gauge.
+    def covariances(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]:
+        """Return two covariances of reflectances and roughnesses, in the gauge.
 
-        The first is that by the observations as the fit weighs them, with independent noise; the second the widest of
-        it and (1).  The third is that by errors of normals, (2).
+        The first is that by the observations as the fit weighs them; the second the widest of it and (1).
         """
         materials = self.materials
         values = by_unknowns(materials).reshape(-1)
-        # S, s_k and d_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
+        # S and s_k, from logarithms to reflectances: ∂ log k/∂k = 1/k
         precision, scores = information(self.systems(with_scores=True), len(values))
-        clusters = [light_scores[0] / values for light_scores in scores]
+        clusters = [light_scores / values for light_scores in scores]
         inverse = regularised_inverse(precision / np.outer(values, values), materials, self.problem)
         by_fit = project_to_gauge(inverse, materials, self.problem)
-        covariance = widest_covariance(inverse, clusters, materials, self.problem)
-        turns = [turn / values for light_scores in scores for turn in light_scores[1:]]
-        by_turns = np.vstack([np.zeros((0, len(values))), *turns]) @ inverse
-        return by_fit, covariance, project_to_gauge(by_turns.T @ by_turns, materials, self.problem)
+        return by_fit, widest_covariance(inverse, clusters, materials, self.problem)
 
     def standard_errors(self) -> MaterialErrors:
         """Return the standard error of every material unknown by the observations alone."""
-        _, by_data, by_normals = self.covariances()
+        _, by_data = self.covariances()
         deviation = residual_deviation(self.problem, self.fit.point)
         free = self.problem.known.free(len(self.materials)).reshape(-1, UNKNOWNS)
         model_errors = free * deviation * MODEL_ERROR * by_unknowns(self.materials)
         # an error is at most the width of its unknown's range
-        errors = np.minimum(np.hypot(np.sqrt(np.diag(by_data + by_normals)).reshape(free.shape), model_errors), WIDTHS)
+        errors = np.minimum(np.hypot(np.sqrt(np.diag(by_data)).reshape(free.shape), model_errors), WIDTHS)
         return MaterialErrors(Materials.from_rows(errors), deviation, np.zeros_like(errors))
 
     def with_prior(self) -> tuple[Materials, MaterialErrors]:
@@ -193,16 +177,15 @@ class Posterior:
         values = by_unknowns(self.materials)
         unknowns = material_unknowns(self.materials)
         free = self.problem.known.free(len(unknowns)).reshape(-1, UNKNOWNS)
-        # normals, and the part of MODEL_ERROR beyond 1 σ, let the prior move the estimate; its part up to 1 σ only
-        # widens the error
+        # the part of MODEL_ERROR beyond 1 σ lets the prior move the estimate; its part up to 1 σ only widens the error
         noise = min(deviation, 1.0)
         excess = np.sqrt(deviation**2 - noise**2)
         posteriors = []
         for m, theta in enumerate(unknowns):
             rows = slice(UNKNOWNS * m, UNKNOWNS * (m + 1))
-            fitted, data, normals = (each[rows, rows] / np.outer(values[m], values[m]) for each in covariances)
+            fitted, data = (each[rows, rows] / np.outer(values[m], values[m]) for each in covariances)
             name = self.problem.known.classes.get(m)
-            model = normals + np.diag((excess * MODEL_ERROR) ** 2)
+            model = np.diag((excess * MODEL_ERROR) ** 2)
             posteriors.append(material_posterior(theta, fitted, data, model, free[m], name))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
         deviations = np.hypot([posterior.deviation for posterior in posteriors], free * noise * MODEL_ERROR)
@@ -226,7 +209,7 @@ class Posterior:
             free = light.free
             errors = np.empty((len(directions), 3))
             p = int(free.sum())
-            covariance = cholesky_inverse(system.factor[: 3 * p, : 3 * p])
+            covariance = cholesky_inverse(system.factor[: light.integrated, : light.integrated])
             overlap = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis))
             for c in range(3):
                 cells = slice(c * p, (c + 1) * p)
@@ -245,24 +228,9 @@ def by_unknowns(materials: Materials) -> Float[np.ndarray, "m 7"]:
     return np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
 
 
-def normal_turns(likelihood: LightLikelihood) -> list[Grouping]:
-    """Return the changes of a light's residuals by turns of normals about each axis, grouped by photo and material."""
-    block = likelihood.illumination.block
-    if block.confidence is None:
-        return []
-    weight = likelihood.illumination.root_weights(
-        likelihood.illumination.residuals(), likelihood.loss, likelihood.temperature
-    )
-    slopes = likelihood.illumination.by_normal() * weight[:, :, None]
-    group = np.unique(np.column_stack([block.photo, block.material]), axis=0, return_inverse=True)[1].reshape(-1)
-    deviation = normal_deviation(block)[:, None]
-    turned = [deviation * np.cross(axis, block.normal) for axis in np.eye(3)]
-    return [Grouping(group, np.einsum("ncx,nx->nc", slopes, turn)) for turn in turned]
-
-
 def information(
     systems: Sequence[System], size: int
-) -> tuple[Float[np.ndarray, "k k"], list[list[Float[np.ndarray, "g k"]]]]:
+) -> tuple[Float[np.ndarray, "k k"], list[Float[np.ndarray, "g k"]]]:
     """Return the materials' information and the scores of groups, with the lights eliminated.
 
     Args:
@@ -270,7 +238,7 @@ def information(
         size: Number of material unknowns.
 
     Returns:
-        S [size, size], and for each light its scores by grouping [g, size], less the part that the light absorbs.
+        S [size, size], and for each light its scores [g, size], less the part that the light absorbs.
     """
     hessian = np.zeros((size, size))
     scores = []
@@ -279,10 +247,9 @@ def information(
         # Σ M − C_i L_i⁻¹ C_iᵀ
         hessian[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
         k = len(part.places)
-        scores.append([np.zeros((len(values), size)) for values in part.scores])
-        for reduced, values in zip(scores[-1], part.scores, strict=True):
-            # s_m − s_l L_i⁻¹ C_iᵀ
-            reduced[:, part.places] = values[:, :k] - values[:, k:] @ coupling
+        # s_m − s_l L_i⁻¹ C_iᵀ
+        scores.append(np.zeros((len(part.scores), size)))
+        scores[-1][:, part.places] = part.scores[:, :k] - part.scores[:, k:] @ coupling
     return (hessian + hessian.T) / 2, scores
 
 

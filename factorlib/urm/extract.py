@@ -70,7 +70,7 @@ def extract_observations(
 
     Args:
         photo: Channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`.
-        geometry: Channels normal.x/y/z, view.x/y/z, depth, label, confidence of the stage `align`.
+        geometry: Channels normal.x/y/z, view.x/y/z, depth, label, object, confidence of the stage `align`.
         source: Name, illumination and exposure of the photo.
         materials: Names of all materials, in the order of their labels.
         least_confidence: Pixels whose normals are less certain are excluded; from 0 to 1.
@@ -103,6 +103,7 @@ def extract_observations(
         weight=sure,
         confidence=sure,
         place=place.astype("f4"),
+        object=np.rint(geometry["object"][pixels]).astype("i2"),
         materials=tuple(materials),
         photos=(source.photo,),
         illuminations=(source.illumination,),

@@ -3,10 +3,10 @@
 The Parquet form is fixed (docs/formats.md): all vectors in the camera frame, radiance linear. The names behind the
 indices and the units are in the schema metadata under the key `factorlib`.
 
-Four columns are optional. `visibility` is there if some observation does not see every direction. It has K bytes: the
+Five columns are optional. `visibility` is there if some observation does not see every direction. It has K bytes: the
 visible share of each direction of `fibonacci_sphere(K)`, 0 to 255. `met`, beside it, tells which surface hides a
 direction. `confidence` is the confidence of each normal; `weight` is the same until observations are sampled or merged.
-`place` is the position of the point, as defined in `factorlib.light.distance`.
+`place` is the position of the point, as defined in `factorlib.light.distance`; `object` the number of its object.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ class Observations(msgspec.Struct, frozen=True):
     exposures     t·S/N² of each photo from EXIF, None if it is unknown
     confidence    confidence of the normal, 0 to 1
     place         position as in `factorlib.light.distance`
+    object        number of the object in its photo, from 1
     detail        factor on the diffuse reflectance
     given_normal  normal of the mesh as given, where `normal` is another; cells are made of it (`cell_normal`)
     """
@@ -85,6 +86,7 @@ class Observations(msgspec.Struct, frozen=True):
     exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
+    object: Int[np.ndarray, " n"] | None = None  # number in the photo, from 1, as in `align`; None: one object
     detail: Float[np.ndarray, "n 3"] | None = None  # factor on diffuse reflectance, never written; None: 1
     given_normal: Float[np.ndarray, "n 3"] | None = None  # never written; None: `normal` is that of the mesh
 
@@ -126,7 +128,7 @@ COLUMNS = {
     "weight": "f4",
 }
 VECTORS = ("normal", "view", "radiance", "clipped", "place")
-OPTIONAL = {"confidence": "f4", "place": "f4"}  # types of the optional columns
+OPTIONAL = {"confidence": "f4", "place": "f4", "object": "i2"}  # types of the optional columns
 # tuples of names, and the columns of indices into them
 NAMES = {
     "materials": "material",
@@ -141,7 +143,7 @@ WIDE: dict[str, tuple[str, np.dtype, int, str]] = {
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
-    """Write the fixed Parquet columns, and `confidence`, `place`, `visibility` and `met` if they are present."""
+    """Write the fixed Parquet columns, and the optional ones that are present."""
     columns = {}
     for name, dtype in {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}.items():
         if (values := getattr(observations, "half_vector" if name == "half" else name)) is not None:
@@ -232,7 +234,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     fills = {name: (dtype, nothing) for name, (_, dtype, nothing, _) in WIDE.items()}
     fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0), "detail": (np.dtype("f4"), 1)}
-    # optional columns: parts without them get full visibility, full confidence, and the origin as place
+    fills["object"] = (np.dtype("i2"), 1)
+    # optional columns: parts without them get full visibility, full confidence, the origin as place, and one object
     for name, (dtype, fill) in fills.items():
         columns = [getattr(part, name) for part in parts]
         shapes = {values.shape[1:] for values in columns if values is not None}

@@ -1,11 +1,11 @@
 """Fewer observations with little loss of information: merging of similar ones, and a stratified, weighted sample.
 
 Merging: Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the
-front). Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
-mean. Normal, view, radiance, place, confidence and detail are averaged, so that the error is second order in the cell's
-size. Radiance is linear in visibility, so mean visibility belongs to mean radiance. But on a flat seat all points would
-merge into one, and the information of their shadows about the light would be lost. So points merge only if the
-directions hidden from them are similar, by the mean over the sphere of hidden × direction.
+front). Pixels of one photo, object, material and clipping state that fall into one cell of both are replaced by their
+weighted mean. Normal, view, radiance, place, confidence and detail are averaged, so that the error is second order in
+the cell's size. Radiance is linear in visibility, so mean visibility belongs to mean radiance. But on a flat seat all
+points would merge into one, and the information of their shadows about the light would be lost. So points merge only if
+the directions hidden from them are similar, by the mean over the sphere of hidden × direction.
 
 Sampling, which is deterministic: Strata are the materials, their clipping states, and cells of normals. Pixels of one
 stratum are nearly redundant, so large strata are thinned first. Each stratum keeps its pixels up to a number that is
@@ -39,6 +39,8 @@ def merge(observations: Observations, degrees: float) -> Observations:
     mirror = mirror_directions(observations.cell_normal, observations.view)
     flags = observations.clipped @ np.array([1, 2, 4])
     cells = [direction_cells(observations.cell_normal, cell), direction_cells(mirror, 2 * cell)]
+    if observations.object is not None:
+        cells.append(observations.object[:, None])
     if observations.detail is not None:
         cells.append(np.rint(np.log(np.maximum(observations.detail, 1e-3)) / DETAIL_CELL).astype(np.int64))
     if (visibility := observations.visibility) is not None:  # mean of hidden × direction

@@ -7,8 +7,7 @@ import pytest
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
-from factorlib.inference import forward, optimizer
-from factorlib.inference.blocks import Block
+from factorlib.inference import optimizer
 from factorlib.inference.fit import FitSchedule, fit_problem, initial_fit
 from factorlib.inference.gauge import BRIGHTEST, fix_gauge
 from factorlib.inference.identifiability import tinted_alike
@@ -17,7 +16,6 @@ from factorlib.inference.lights import Light
 from factorlib.inference.material_prior import MaterialPrior, PriorTerms, material_unknowns
 from factorlib.inference.materials import LEAST_REFLECTANCE, Point
 from factorlib.inference.misfit import unexplained_shares
-from factorlib.inference.normal_errors import DEVIATION
 from factorlib.inference.optimizer import Descent, step_light
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import insert_known
@@ -25,7 +23,6 @@ from factorlib.inference.uncertainty import (
     LARGEST_RELATIVE_ERROR,
     WIDTHS,
     Posterior,
-    by_unknowns,
     project_to_gauge,
 )
 from factorlib.light.latlong import map_energy
@@ -277,57 +274,6 @@ def test_lights_lie_within_their_standard_errors(fit):
     maps = posterior.relative_standard_errors()
     assert set(maps) == {"room0", "room1", "room2"}
     assert all(((m > 0) & (m <= LARGEST_RELATIVE_ERROR)).all() and np.isfinite(m).all() for m in maps.values())
-
-
-def test_errors_of_normals_are_how_far_materials_move_when_normals_turn(monkeypatch):
-    """Against the slow and obvious: a step of all materials and lights together, with the normals of each part turned."""
-    angle, replaced = 1e-4, msgspec.structs.replace
-    monkeypatch.setattr(forward, "NORMAL_STEP", angle)
-    sure = np.array([1.0, 0.5, 0.2])
-    problem, true = photographed(5, 2, cells=40, size=10, noise=0.0)
-    problem = problem.with_blocks([replaced(block, confidence=sure[block.material]) for block in problem.blocks])
-    fit = initial_fit(Point(MATERIALS, true))
-    posterior = Posterior(problem, fit, PRIOR)
-
-    def gradients(blocks: list[Block]) -> list[np.ndarray]:
-        """Half the gradient of each light's φ by materials and light."""
-        systems = Posterior(problem.with_blocks(blocks), fit, PRIOR).systems(with_scores=True)
-        return [np.concatenate([s.material_gradient, s.light_gradient]) for s in systems]
-
-    # the Hessian of all unknowns, 21 of the materials before those of the lights
-    systems = posterior.systems(with_scores=True)
-    first = np.cumsum([21, *(len(s.light_gradient) for s in systems)])
-    places = [np.append(s.places, np.arange(*ends)) for s, *ends in zip(systems, first, first[1:])]
-    hessian = np.zeros((first[-1],) * 2)
-    for s, place in zip(systems, places, strict=True):
-        hessian[np.ix_(place, place)] += np.block(
-            [[s.material_hessian, s.cross_hessian], [s.cross_hessian.T, s.light_hessian]]
-        )
-    # a priori, every reflectance is known to 1 and roughness to its range, as in `regularised_inverse`
-    values = by_unknowns(MATERIALS)
-    hessian[range(21), range(21)] += ((values / WIDTHS) ** 2).reshape(-1)
-    before, expected = gradients(problem.blocks), np.zeros((21, 21))
-    for k, block in enumerate(problem.blocks):
-        for material, c in enumerate(sure):
-            for axis in np.eye(3):
-                turn = angle * np.cross(axis, block.normal) * (block.material == material)[:, None]
-                normal = (block.normal + turn) / np.linalg.norm(block.normal + turn, axis=1, keepdims=True)
-                blocks = [*problem.blocks[:k], replaced(block, normal=normal), *problem.blocks[k + 1 :]]
-                change = np.zeros(first[-1])
-                for place, old, new in zip(places, before, gradients(blocks), strict=True):
-                    change[place] += new - old
-                step = np.linalg.solve(hessian, change)[:21] / angle * DEVIATION * np.sqrt(1 / c**2 - 1)
-                expected += np.outer(step, step)
-    expected = project_to_gauge(expected * np.outer(values, values), MATERIALS, problem)
-    given = posterior.covariances()[2]
-    assert np.diag(expected)[[7, 14, 20]].min() > 0
-    np.testing.assert_allclose(given, expected, atol=0.02 * np.abs(expected).max())
-    np.testing.assert_allclose(np.diag(given), np.diag(expected), rtol=0.05)
-    certain = problem.with_blocks([replaced(block, confidence=np.ones(len(block))) for block in problem.blocks])
-    assert not Posterior(certain, fit, PRIOR).covariances()[2].any()
-
-
-# ── what is said of the lights' colour ──────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize(

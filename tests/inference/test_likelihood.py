@@ -18,7 +18,8 @@ from factorlib.inference.material_prior import (
     materials_from_unknowns,
     shipped_classes,
 )
-from factorlib.inference.materials import Materials
+from factorlib.inference.materials import Materials, Point
+from factorlib.inference.normal_errors import with_normal_errors
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.responses import ResponseTable
 from factorlib.scenes.joint_problems import MATERIALS, sphere_block
@@ -30,10 +31,11 @@ THETA = material_unknowns(MATERIALS)
 
 
 def prior_of(light, precision) -> float:
-    """uᵀQu and the Gaussians of exposures and tone exponents."""
+    """uᵀQu and the Gaussians of turns, exposures and tone exponents."""
     u = light.log_radiance.reshape(-1)
     return float(
         u @ precision @ u
+        + light.turns @ light.turns
         + np.sum((light.log_exposure / EXPOSURE_DEVIATION) ** 2)
         + np.sum((light.log_tone / TONE_DEVIATION) ** 2)
     )
@@ -52,18 +54,26 @@ def posterior(one) -> float:
 
 def moved(light, step):
     """The light after a step of all its unknowns."""
-    cells, exposures, tones = np.split(step, [3 * len(light), 3 * len(light) + len(light.log_exposure) - 1])
+    counts = [3 * len(light), len(light.turns), len(light.log_exposure) - 1]
+    cells, turns, exposures, tones = np.split(step, np.cumsum(counts))
     light = light.with_log_radiance(light.log_radiance + cells.reshape(3, -1))
     exposure = light.log_exposure + np.concatenate([[0.0], exposures])
-    return msgspec.structs.replace(light, log_exposure=exposure, log_tone=light.log_tone + tones)
+    return msgspec.structs.replace(
+        light, turns=light.turns + turns, log_exposure=exposure, log_tone=light.log_tone + tones
+    )
 
 
-@pytest.fixture(scope="module", params=["one photo", "three photos"])
+@pytest.fixture(scope="module", params=["one photo", "three photos", "three turned photos"])
 def here(request):
     """The true light, off by a little, in the likelihood of what its photos show; tone curves are the identity for the determinant."""
     exposure = [0.0] if request.param == "one photo" else [0.0, 0.4, -0.5]
     light = on_even_cells(drawn(1, CELLS), exposure)
     problem = spheres([light], size=8)
+    if request.param == "three turned photos":
+        block = msgspec.structs.replace(problem.blocks[0], confidence=np.ones(len(problem.blocks[0])))
+        problem = with_normal_errors(problem.with_blocks([block]), Point(MATERIALS, [light]))
+        light = light.with_turns(9)
+        light.turns[:] = np.random.default_rng(6).normal(size=9)
     u = light.log_radiance - np.log(problem.blocks[0].unit)
     return likelihood(problem, light.with_log_radiance(u + 0.1 * np.random.default_rng(3).normal(size=u.shape)))
 
@@ -98,7 +108,7 @@ def test_the_determinant_by_light_is_half_the_finite_difference_of_log_det(here)
     light, rng, by_light = here.light, np.random.default_rng(4), here.normal_equations().determinant_by_light
     unit = np.eye(light.unknowns)
     all_cells, one_cell = unit[: 3 * CELLS].sum(0), unit[by_light[: 3 * CELLS].argmax()]
-    for step in (all_cells, one_cell, rng.normal(size=light.unknowns), *unit[3 * CELLS :]):
+    for step in (all_cells, one_cell, rng.normal(size=light.unknowns), *unit[light.integrated :]):
         high, low = (log_det(here.with_point(moved(light, sign * 5e-3 * step))) for sign in (1, -1))
         assert by_light @ step == pytest.approx((high - low) / 1e-2 / 2, rel=0.01, abs=0.01 * np.abs(by_light).max())
 
@@ -340,3 +350,17 @@ def test_gloss_ten_times_too_strong_at_roughness_1_is_not_expected():
     assert cost([0.3] * 3, 1.0) > cost(*PLASTIC) + 6
     assert cost([0.03] * 3, 1.0) > cost(*PLASTIC) + 6
     assert cost(*PLASTIC) + 3 < cost([0.3] * 3, 0.2) < cost([0.3] * 3, 1.0)
+
+
+def test_the_gradient_without_a_jacobian_is_that_of_the_normal_equations(here):
+    gradient, system = here.gradient(), here.normal_equations(determinants=False)
+    assert gradient.value == pytest.approx(system.value, rel=1e-6)
+    np.testing.assert_allclose(gradient.by_light, system.light_gradient, atol=1e-4 * np.abs(gradient.by_light).max())
+
+
+def test_the_determinant_is_that_of_cells_and_turns(here):
+    system = here.normal_equations(determinants=False)
+    count = here.light.integrated
+    assert count == 3 * CELLS + len(here.light.turns)
+    log_det = np.linalg.slogdet(system.light_hessian[:count, :count])[1] - here.log_determinant
+    assert here.marginal(system) - system.value == pytest.approx(log_det)

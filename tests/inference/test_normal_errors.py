@@ -1,13 +1,14 @@
-"""Variance of observations by errors of their normals: held to draws of turned normals."""
+"""Errors of normals: held to draws of turned normals and to turned objects."""
 
 import msgspec
 import numpy as np
 import pytest
 
 from factorlib.inference.blocks import Noise
+from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_problem
 from factorlib.inference.forward import Illumination
 from factorlib.inference.materials import Point
-from factorlib.inference.normal_errors import DEVIATION, with_normal_errors
+from factorlib.inference.normal_errors import DEVIATION, POSE_DEVIATION, normal_errors, with_normal_errors
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
@@ -18,9 +19,11 @@ from factorlib.scenes.joint_problems import (
     sphere_block,
     sphere_normals,
 )
+from tests.inference.made_lights import PRIOR, drawn, on_even_cells, spheres
 
 OPERATOR = reflection_operator("closed_form")
 DRAWS = 400
+CELLS = 120
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +63,45 @@ def test_the_variance_is_that_of_radiance_at_turned_normals(problem):
     ratio = (1 + variance) / widening(*problem) ** 2
     assert np.median(ratio) == pytest.approx(1, abs=0.01)
     assert np.quantile(np.abs(ratio - 1), 0.9) < 0.15
+
+
+def test_turns_of_poses_are_the_change_of_radiance_that_they_cause(problem):
+    of, point = problem
+    (block,) = of.blocks
+    two_objects = msgspec.structs.replace(block, object=(block.normal[:, 0] > 0).astype(int))
+    (errors,) = normal_errors(of.with_blocks([two_objects]), point)
+    turns = np.random.default_rng(1).normal(size=6)
+    angle = 0.1 * POSE_DEVIATION * turns.reshape(2, 3)[two_objects.object]
+    turned = block.normal + np.cross(angle, block.normal)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    before, after = (
+        Illumination(
+            msgspec.structs.replace(block, normal=normal), point.lights[0], point.materials, OPERATOR
+        ).radiance()
+        for normal in (block.normal, turned)
+    )
+    change = 10 * (after - before)
+    np.testing.assert_allclose(errors.by_turns @ turns, change, atol=0.02 * np.abs(change).max())
+
+
+def test_the_fit_finds_the_turns_of_poses():
+    """Of photos in one light, up to a turn of all, which the light shares."""
+    light = on_even_cells(drawn(2, CELLS), [0.0, 0.0, 0.0])
+    true = spheres([light], noise=0.1)
+    turns = np.random.default_rng(3).normal(size=(3, 3))
+    normal = true.blocks[0].normal + np.cross(POSE_DEVIATION * turns[true.blocks[0].photo], true.blocks[0].normal)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    (block,) = true.blocks
+    turned = Illumination(msgspec.structs.replace(block, normal=normal), light, MATERIALS, OPERATOR).radiance()
+    sure = np.ones(len(block))
+    block = msgspec.structs.replace(block, confidence=sure, radiance=turned / block.unit)
+    light = light.with_log_radiance(light.log_radiance - np.log(block.unit))
+    problem = with_normal_errors(JointProblem([block], OPERATOR), Point(MATERIALS, [light]))
+    start = Fit(Point(MATERIALS, [light]), [Hyperparameters(temperature=1.0)])
+    fit = fit_problem(problem, start, PRIOR, FitSchedule(6, materials_fixed=True))
+    found = fit.point.lights[0].turns.reshape(3, 3)
+    relative, wanted = (each - each.mean(0) for each in (found, turns))
+    assert np.abs(relative - wanted).max() < 0.3 and np.abs(wanted).max() > 1
 
 
 def test_sure_normals_count_in_full_and_unsure_ones_less(problem):

@@ -31,7 +31,10 @@ def step(folder, poses: dict[str, Pose]):
     for stage in ("masks", "align"):
         (folder / stage).mkdir(parents=True)
     channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
-    write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "depth": maps.depth, "confidence": inside})
+    write_exr(
+        folder / "align" / "a.exr",
+        {**channels, "label": maps.label, "depth": maps.depth, "confidence": inside, "object": maps.object},
+    )
     channels = dict.fromkeys("RGB", inside) | {"left_out": 0 * inside} | {f"clipped.{c}": 0 * inside for c in "RGB"}
     write_exr(folder / "masks" / "a.exr", {**channels, "label": maps.label, "valid": inside})
     size = [CAMERA.width, CAMERA.height]

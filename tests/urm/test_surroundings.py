@@ -63,7 +63,7 @@ def observe(scene, colour=lambda point: 0.4, **changed):
     photo |= {"label": label, "valid": np.ones(size)}
     view = -CAMERA.rays() / np.linalg.norm(CAMERA.rays(), axis=-1, keepdims=True)
     geometry = {f"{name}.{a}": view[..., k] for name in ("normal", "view") for k, a in enumerate("xyz")}
-    geometry |= {"depth": np.full(size, 4.0), "label": label, "confidence": np.ones(size)}
+    geometry |= {"depth": np.full(size, 4.0), "label": label, "confidence": np.ones(size), "object": np.ones(size)}
     objects = Occluders([sphere(1.0)], [Pose(np.eye(3), BALL)])
     source = SimpleNamespace(photos=("a",), illuminations=("a",))
     return ground_observations(photo | changed, geometry, GroundView(CAMERA, GROUND, objects), source, DIRECTIONS)

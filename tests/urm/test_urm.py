@@ -29,7 +29,7 @@ def photo_and_geometry(size=64):
     label = np.where(x < 0, 1, 2) * one
     vectors = {"normal": (x * one, y * one, z * one), "view": (0 * one, 0 * one, -one)}
     geometry = {f"{name}.{axis}": v for name, vector in vectors.items() for axis, v in zip("xyz", vector)}
-    geometry |= {"label": label, "depth": (4 + z) * one, "confidence": one}
+    geometry |= {"label": label, "depth": (4 + z) * one, "confidence": one, "object": one}
     photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": label, "valid": one}
     photo |= {f"clipped.{c}": (y < -0.8) * one for c in "RGB"}
     return photo, geometry
