@@ -13,7 +13,7 @@ import pytest
 from factorlib.runner import display, verbs
 from factorlib.runner.plan import Step, hash_of
 from factorlib.runner.project import Pipeline, Stage, with_settings
-from factorlib.runner.results_folder import clean, make_view
+from factorlib.runner.results_folder import clean, make_view, verify
 from factorlib.runner.run_folder import begin_run, end_run
 from factorlib.runner.store import MADE_FROM, Store, hash_of_file, is_locked, lock
 from tests.faults.test_kills import start, wait_until
@@ -354,6 +354,7 @@ def test_what_one_checkout_makes_the_other_has(tmp_path, one, capsys):
     assert "all 6 steps are current" in capsys.readouterr().out
     assert make(other) == 0 and computed(other) == 0
     assert files_of(other.build / "set" / "total") == files_of(one.build / "set" / "total")
+    assert set(state(other).values()) == {"current"} and verify(other, None) == 0
 
 
 def test_clean_does_not_delete_what_others_need(tmp_path, one, shared):
