@@ -46,6 +46,11 @@ DEVIATION = np.radians(1.0)
 POSE_DEVIATION = np.radians(0.6)
 
 
+def normal_variance(block: Block) -> Float[np.ndarray, " n"]:
+    """Return the variance of each observation's normal along a tangent, that of a sure one included; 0 if all are."""
+    return np.zeros(len(block)) if block.confidence is None else (DEVIATION / block.confidence) ** 2
+
+
 class NormalErrors(msgspec.Struct, frozen=True):
     """Errors of the normals of one light's n observations.
 
@@ -95,8 +100,8 @@ def _errors(illumination: Illumination) -> NormalErrors:
         return NormalErrors(np.ones((n, 3)), np.zeros((n, 3, 0)))
     slopes = illumination.by_normal()
     # σ/σ' of (1)
-    alone = DEVIATION * np.sqrt(np.maximum(block.confidence**-2.0 - 1, 0))
-    weight = 1 / np.hypot(1, np.linalg.norm(slopes, axis=2) * alone[:, None])
+    alone = normal_variance(block)[:, None] - DEVIATION**2
+    weight = 1 / np.sqrt(1 + np.square(slopes).sum(2) * alone)
     # ∂y/∂η of (2): a column for each axis of each object in each photo
     axes = np.stack([np.cross(axis, block.normal) for axis in np.eye(3)], axis=2)
     by_axis = POSE_DEVIATION * (slopes @ axes) / np.maximum(block.inverse_sigma, TINY)[:, :, None]

@@ -25,6 +25,15 @@ Variables   S comes from the system of φ (`factorlib.inference.likelihood`), wi
 Model       More observations do not remove errors of the model itself, mostly of the mesh.  MODEL_ERROR is therefore
             added in quadrature, in proportion to the residuals.
 
+Blur        Normals that are wrong by s along each tangent spread a highlight as roughness does: the slopes of
+            microfacets have the variance α²/2 along an axis (α = roughness²), and those of normals s².  So what is
+            seen is α² + 2s², and roughness has the further error
+
+                (roughness⁴ + 2s²)^¼ − roughness                                                                     (2)
+
+            with s² the mean over the material's observations, by their information on roughness.  The prior may move
+            a material along it; k_d and k_s follow as the observations demand.
+
 Prior       `factorlib.inference.material_posterior` combines this covariance with the prior on materials.
 
 Lights      Given the materials, log radiance of a light has the covariance Σ = H⁻¹.  A map's radiance in direction d is
@@ -35,6 +44,7 @@ Lights      Given the materials, log radiance of a light has the covariance Σ =
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -43,11 +53,11 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.inference.fit import Fit, Hyperparameters, light_likelihood, reliable_observations
+from factorlib.inference.fit import Fit, light_likelihood, reliable_observations
 from factorlib.inference.fit_runner import Solution
-from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.likelihood import (
+    LightLikelihood,
     System,
     cholesky_factor,
     cholesky_inverse,
@@ -64,11 +74,12 @@ from factorlib.inference.materials import (
     Materials,
     Point,
 )
+from factorlib.inference.normal_errors import normal_variance
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
 from factorlib.light.prior import LightPrior
-from factorlib.robust import robust_deviation
+from factorlib.robust import TINY, robust_deviation
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 GIVEN = "; where a material or a light is known, that alone is fixed"
@@ -132,19 +143,39 @@ class Posterior:
         self.tick = tick
         self.materials = materials_from_unknowns(material_unknowns(fit.point.materials))  # reflectances above zero
 
+    def likelihoods(self, materials_given: bool = False) -> list[LightLikelihood]:
+        """Return the likelihood of each illumination."""
+        illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
+        build = partial(light_likelihood, prior=self.prior, materials_given=materials_given, tables=self.problem.tables)
+        pairs = list(zip(illuminations, self.fit.hyperparameters, strict=True))
+        return list(self.problem.spread(lambda pair: build(*pair), pairs))
+
     def systems(self, with_scores: bool) -> list[System]:
         """Return the system of φ of each illumination, with scores of clusters of observations if requested."""
 
-        def system(pair: tuple[Illumination, Hyperparameters]) -> System:
+        def system(likelihood: LightLikelihood) -> System:
             """Return the system of one illumination."""
-            likelihood = light_likelihood(*pair, self.prior, not with_scores, self.problem.tables)
-            group = pair[0].block.clusters() if with_scores else None
+            group = likelihood.illumination.block.clusters() if with_scores else None
             result = likelihood.normal_equations(determinants=False, group=group)
             self.tick()
             return result
 
-        illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
-        return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
+        return list(self.problem.spread(system, self.likelihoods(not with_scores)))
+
+    def blur(self) -> Float[np.ndarray, " m"]:
+        """Return the error of each material's roughness by errors of normals, (2)."""
+        roughness = self.materials.roughness
+        total, weighted = np.zeros((2, len(roughness)))
+        for likelihood in self.likelihoods():
+            illumination = likelihood.illumination
+            block = illumination.block
+            # ∂r/∂roughness of each observation
+            slope = illumination.predict().by_roughness * self.materials.specular[block.material] * block.inverse_sigma
+            information = np.square(slope).sum(1)
+            total += np.bincount(block.material, information, len(roughness))
+            weighted += np.bincount(block.material, information * normal_variance(block), len(roughness))
+        variance = weighted / np.maximum(total, TINY)
+        return (roughness**4 + 2 * variance) ** 0.25 - roughness
 
     def covariances(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]:
         """Return two covariances of reflectances and roughnesses, in the gauge.
@@ -166,6 +197,7 @@ class Posterior:
         deviation = residual_deviation(self.problem, self.fit.point)
         free = self.problem.known.free(len(self.materials)).reshape(-1, UNKNOWNS)
         model_errors = free * deviation * MODEL_ERROR * by_unknowns(self.materials)
+        model_errors[:, REFLECTANCES] = free[:, REFLECTANCES] * np.hypot(model_errors[:, REFLECTANCES], self.blur())
         # an error is at most the width of its unknown's range
         errors = np.minimum(np.hypot(np.sqrt(np.diag(by_data)).reshape(free.shape), model_errors), WIDTHS)
         return MaterialErrors(Materials.from_rows(errors), deviation, np.zeros_like(errors))
@@ -181,11 +213,14 @@ class Posterior:
         noise = min(deviation, 1.0)
         excess = np.sqrt(deviation**2 - noise**2)
         posteriors = []
+        blur = self.blur()
         for m, theta in enumerate(unknowns):
             rows = slice(UNKNOWNS * m, UNKNOWNS * (m + 1))
             fitted, data = (each[rows, rows] / np.outer(values[m], values[m]) for each in covariances)
             name = self.problem.known.classes.get(m)
-            model = np.diag((excess * MODEL_ERROR) ** 2)
+            # the other unknowns follow roughness as the observations demand
+            blurred = blur[m] * fitted[:, REFLECTANCES] / max(fitted[REFLECTANCES, REFLECTANCES], TINY)
+            model = np.diag((excess * MODEL_ERROR) ** 2) + np.outer(blurred, blurred)
             posteriors.append(material_posterior(theta, fitted, data, model, free[m], name))
         materials = materials_from_unknowns(np.array([posterior.theta for posterior in posteriors]))
         deviations = np.hypot([posterior.deviation for posterior in posteriors], free * noise * MODEL_ERROR)

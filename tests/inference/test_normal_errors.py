@@ -7,10 +7,12 @@ import pytest
 from factorlib.inference.blocks import Noise
 from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_problem
 from factorlib.inference.forward import Illumination
-from factorlib.inference.materials import Point
+from factorlib.inference.lights import Light
+from factorlib.inference.materials import Materials, Point
 from factorlib.inference.normal_errors import DEVIATION, POSE_DEVIATION, normal_errors, with_normal_errors
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
+from factorlib.inference.uncertainty import Posterior
 from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import (
     MATERIALS,
@@ -129,3 +131,36 @@ def test_confidence_is_no_factor_on_the_weight():
         for sure in (np.full(len(normal), 0.25), np.ones(len(normal)))
     ]
     np.testing.assert_allclose(blocks[0].inverse_sigma, blocks[1].inverse_sigma)
+
+
+def blur(problem, point) -> np.ndarray:
+    """Return the error of each roughness by errors of normals."""
+    return Posterior(problem, Fit(point, [Hyperparameters()]), PRIOR).blur()
+
+
+@pytest.mark.parametrize("roughness", [0.25, 0.5])
+def test_turned_normals_look_as_rough_as_the_error_of_roughness_says(roughness):
+    """Of a mirror-like sphere in one narrow lobe: the mean over draws, fitted by another roughness."""
+    axis = np.array([0.3, -0.4, -1.0])
+    light = Light(axis[None] / np.linalg.norm(axis), np.log([2000.0]), np.full((1, 3), 100.0), np.zeros(1))
+    metal = Materials(np.zeros((1, 3)), np.full((1, 3), 0.5), np.array([roughness]))
+    block = sphere_block("light0", light, metal, [0], OPERATOR, size=40)
+    rng = np.random.default_rng(2)
+    confidence = 0.2
+    drawn = []
+    for _ in range(60):
+        turn = DEVIATION / confidence * rng.normal(size=block.normal.shape)
+        turned = block.normal + np.cross(turn, block.normal)
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        one = Illumination(msgspec.structs.replace(block, normal=turned), light, metal, OPERATOR)
+        drawn.append(one.radiance())
+    mean = np.mean(drawn, axis=0)
+    candidates = np.linspace(roughness, roughness + 0.3, 61)
+    errors = []
+    for r in candidates:
+        rough = Materials(metal.diffuse, metal.specular, np.array([r]))
+        errors.append(np.square(Illumination(block, light, rough, OPERATOR).radiance() - mean).sum())
+    sure = msgspec.structs.replace(block, confidence=np.full(len(block), confidence))
+    stated = blur(JointProblem([sure], OPERATOR), Point(metal, [light]))
+    assert candidates[np.argmin(errors)] - roughness == pytest.approx(stated[0], rel=0.3)
+    assert blur(JointProblem([block], OPERATOR), Point(metal, [light])) == pytest.approx(0)
