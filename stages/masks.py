@@ -66,7 +66,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     height, width = opened.size
     check_pixels(opened.size, params.most_megapixels, path, f"{entry}.image")
     progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
-    labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, f"{entry}.masks")
+    labels = read_labels(facts.masks, inputs.file, facts.labels, opened.size, facts.image, f"{entry}.masks")
     object_masks = [(o.name, o.mask) for o in facts.objects]
     objects = read_object_indices(object_masks, inputs.file, opened.size, f"{entry}.objects")
     # smallest integer factor at which materials and frame fit their limits

@@ -29,7 +29,8 @@ RADIANCE = np.random.default_rng(1).uniform(0, 0.8, (H, W, 3)).astype(np.float32
 CHANNELS = {"R", "G", "B", "label", "valid", "left_out", "object", "clipped.R", "clipped.G", "clipped.B"}
 SMALLER = masks.Params(pixels=100)  # of the 152 that show a material: factor 2
 OWN = [ObjectMask("a", None), ObjectMask("b", "own.png")]
-GIVEN = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "kitchen"}
+GIVEN = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "labels": MATERIALS, "focal_px": None}
+GIVEN["illumination"] = "kitchen"
 
 
 @pytest.fixture
