@@ -23,10 +23,11 @@ from factorlib.results.texture_table import TextureTable, read_table
 
 STAGES = [
     "masks",
+    "shapes",
     "align",
     "urm",
-    "surface",
     "train",
+    "surface",
     "solve",
     "shading",
     "texture",

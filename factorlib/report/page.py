@@ -13,6 +13,7 @@ from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import data_uri, read_png
+from factorlib.inference.suns import LEAST_SUN_SHARE
 from factorlib.jsonfile import read_json
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
@@ -108,6 +109,7 @@ def _facts(run: Artifacts, metrics: Metrics) -> dict[str, Any]:
         "low_iou": LOW_IOU,
         "as_it_is": AS_IT_IS,
         "lights": list(filter(None, lights)),
+        "least_sun_share": LEAST_SUN_SHARE,
         "missing": {why: [name for _, name in group] for why, group in groupby(reasons, itemgetter(0))},
     }
 

@@ -99,6 +99,7 @@ def test_a_photo_that_rejoins_is_solved_with_the_others_from_their_answer_withou
         """Give back the solution from which it starts."""
         photos = solved_photos(msgspec.convert(given.facts["dataset.light"], dict[str, LightSlice]))
         solves.append((photos, given.folders.get("surface"), decided))
+        progress(0, 1)
         shutil.copytree(given["start"], out, dirs_exist_ok=True)
 
     monkeypatch.setattr(stages.solve, "main", solve)
@@ -107,7 +108,7 @@ def test_a_photo_that_rejoins_is_solved_with_the_others_from_their_answer_withou
         write_json(tmp_path / "plain" / "texture.json", TextureTable())
         inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": tmp_path / "plain"})
     (out := tmp_path / "out").mkdir()
-    exchange.main(exchange.Params(), inputs, out, silent)
+    exchange.main(exchange.Params(), inputs, out, Rising())
     assert not read_result(out / FILE, Exchange, "exchange").kept
     assert solves[-1] == (list(TURNS), None, True) and len(solves) == 1 + textured
     after = with_exchange(msgspec.structs.replace(inputs, folders=inputs.folders | {"exchange": out}))
