@@ -106,7 +106,7 @@ def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal)
             "cannot be combined with width",
             "keep across, which crops to the objects, or width, which shows the whole frame",
         )
-    if isinstance(recipe, kinds.ViewRecipe) and recipe.camera is not None:
+    if isinstance(recipe, kinds.ViewedRecipe) and recipe.camera is not None:
         _check_camera(recipe, recipe.camera, photos, refuse)
     if recipe.sun is None:
         return
@@ -122,16 +122,15 @@ def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal)
         refuse("sun.direction", "the direction has no length", "give a vector other than [0, 0, 0]")
 
 
-def _check_camera(recipe: kinds.ViewRecipe, camera: kinds.ViewCamera, photos: list[str], refuse: Refusal) -> None:
+def _check_camera(recipe: kinds.ViewedRecipe, camera: kinds.ViewCamera, photos: list[str], refuse: Refusal) -> None:
     refuse.refuse_if(
         (camera.photo is None) == (camera.pose is None),
         "camera",
         "needs exactly one of photo and pose",
         "write `camera: {photo: NAME}`, or `camera: {pose: [[r, r, r, t], [r, r, r, t], [r, r, r, t]]}`",
     )
-    moved = [
-        name for name in ("azimuth", "elevation", "zoom") if getattr(recipe, name) != getattr(kinds.ViewRecipe(), name)
-    ]
+    usual = type(recipe)()
+    moved = [name for name in ("azimuth", "elevation", "zoom") if getattr(recipe, name) != getattr(usual, name)]
     refuse.refuse_if(moved, "camera", f"cannot be combined with {' and '.join(moved)}", "keep one of the two")
     if camera.photo is not None:
         refuse.check_known("camera.photo", camera.photo, photos, "photo")

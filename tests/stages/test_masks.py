@@ -54,6 +54,18 @@ def run(folder, params=masks.Params(), **facts):
     return read_exr(out / "kitchen.exr"), json.loads((out / "kitchen.json").read_text())
 
 
+def test_the_alpha_of_a_cut_out_is_averaged_down_with_it_and_an_opaque_photo_has_none(folder):
+    codes = np.dstack([np.full((H, W, 3), 120, np.uint8), np.where(LABEL > 0, 255, 40).astype(np.uint8)])
+    Image.fromarray(codes).save(folder / "in" / "photo.png")
+    channels, facts = run(folder, SMALLER, image="photo.png")
+    f = facts["factor"]
+    boxes = codes[: H // f * f, : W // f * f, 3].reshape(H // f, f, W // f, f)
+    np.testing.assert_allclose(channels.pop("alpha"), boxes.mean((1, 3)) / 255, atol=1e-6)
+    assert f == 2 and set(channels) == CHANNELS
+    Image.fromarray(codes | np.array([0, 0, 0, 255], np.uint8)).save(folder / "in" / "photo.png")
+    assert set(run(folder, image="photo.png")[0]) == CHANNELS
+
+
 def refused(folder, **facts):
     error = refusal(".", run, folder, **facts)
     assert error.file and "photos[kitchen]" in error.key
