@@ -193,9 +193,12 @@ def _visible_meshes(
 
 
 def _shape(materials: list[str], cameras: Cameras) -> dict[str, Any]:
-    """Return the entry of a mesh without a file: a hull, a body of revolution, or open where nothing is known."""
+    """Return the entry of a mesh without a file: a hull, a body of revolution, or open where nothing is known.
+
+    A hull has a part of each material without saying so.
+    """
     parts = {"parts": {name: name for name in materials}} if len(materials) > 1 else {"material": materials[0]}
-    return ({"hull": True} if cameras.source else {"lathe": True} if cameras.revolved else {"file": UNKNOWN}) | parts
+    return {"hull": True} if cameras.source else ({"lathe": True} if cameras.revolved else {"file": UNKNOWN}) | parts
 
 
 def _photo_entries(

@@ -84,7 +84,8 @@ class Validation:
 
         Brightness and colour cannot be compared between such groups.
         """
-        unseen = [repr(name) for k, name in enumerate(self.spec.materials, 1) if self._seen and k not in self._seen]
+        names = self.spec.distinct_materials
+        unseen = [repr(name) for k, name in enumerate(names, 1) if self._seen and k not in self._seen]
         cautions = [f"no mask shows {', '.join(unseen)}: remove it, or it is guessed"] if unseen else []
         by_light: dict[str, set[str]] = {}
         for photo in self.spec.photos:
@@ -137,7 +138,7 @@ class Validation:
         if (file := self.spec.meshes[obj.mesh].file) is None:
             return
         part_materials = self.spec.meshes[obj.mesh].part_materials
-        points = read_mesh(self.file(file), self.spec.materials, part_materials, obj.materials).vertices
+        points = read_mesh(self.file(file), self.spec.distinct_materials, part_materials, obj.materials).vertices
         radius = np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1)
         if np.ptp(radius) > NOT_ROUND * radius.max():
             raise InputError(
@@ -170,13 +171,13 @@ class Validation:
         object_masks = [(obj.name, obj.mask) for obj in entry.objects]
         objects = read_object_indices(object_masks, self.file, size, f"{key}.objects")
         object_materials = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
-        check_materials(labels, objects, object_materials, self.spec.materials, file, f"{key}.objects")
+        check_materials(labels, objects, object_materials, self.spec.distinct_materials, file, f"{key}.objects")
 
     def _object(self, obj: MeshInstance, relative: str, limits: Limits) -> None:
         """Check the parts of a mesh file, which is read once if it can be."""
         file = self.file(relative)
         names = self.spec.meshes[obj.mesh].part_materials
-        part_labels(self._parts(file, limits), self.spec.materials, names, obj.materials, file)
+        part_labels(self._parts(file, limits), self.spec.distinct_materials, names, obj.materials, file)
 
 
 def _faults(checks: Iterable[Check]) -> list[InputError]:

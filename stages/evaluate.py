@@ -36,7 +36,9 @@ from factorlib.evaluate.truth import (
 from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
+from factorlib.light.lobes import is_hard, lobe_energy
 from factorlib.render.resynthesis import paint_shading
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
 from factorlib.results.metrics import AlbedoErrors, Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
 from factorlib.results.poses import read_photos, read_poses
@@ -180,7 +182,10 @@ def _verdict(inputs: Inputs, observed: dict[str, list[str]]) -> Verdict | None:
     errors = ball_changes(materials, lights)
     misfit = (uncertainty.unexplained, uncertainty.photos)
     surface = read_surface(inputs.folders.get("surface")).disagreement
-    return verdict(VerdictInputs(errors, *misfit, contours, uncertainty.residual_sigma, overlaps, surface))
+    lobes = read_lobes(inputs["export"] / "lobes.parquet")
+    hard = [name for name, of in lobes.items() if is_hard(of.axis, (of.weight.T * lobe_energy(of.sharpness)).sum(0))]
+    lit_hard = frozenset(m for light in hard for m in observed.get(light, ()))
+    return verdict(VerdictInputs(errors, *misfit, contours, uncertainty.residual_sigma, overlaps, surface, lit_hard))
 
 
 def _lights(

@@ -66,9 +66,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if params.solve.solver == "paper":  # its materials are uniform, and it continues no solution
         write_json(out / EXCHANGE_FILE, decision)
         return
+    rejoining = any(light.rejoins for light in lights.values())
+    half = 0.5 if before.longest and rejoining else 0  # of the work, where it may take two solves
     if before.longest:
         with held_back() as warnings:
-            solve_again(params, inputs, out, progress, before)
+            solve_again(params, inputs, out, part_of(progress, 0, half or 1), before)
         losses = [held_out_loss(table, before) for table in (before, read_table(out / "texture"))]
         decision = Exchange(losses[1] < losses[0], *losses)
         for warning in warnings if decision.kept else ():
@@ -76,8 +78,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         if not decision.kept:
             for name in REPLACED:
                 shutil.rmtree(out / name)
-    if not decision.kept and any(light.rejoins for light in lights.values()):
-        solve_again(params, inputs, out, progress)
+    if not decision.kept and rejoining:
+        solve_again(params, inputs, out, part_of(progress, half, 1))
     write_json(out / EXCHANGE_FILE, decision)
 
 

@@ -16,7 +16,17 @@ from factorlib.images.camera_files import is_raw
 from factorlib.images.exif import reported_processing
 from factorlib.images.exr import write_exr
 from factorlib.images.lens import Undistortion, radial_lens
-from factorlib.images.photo import Photo, box_majority, check_bright, decode_photo, least_factor, open_photo
+from factorlib.images.photo import (
+    OPAQUE,
+    Photo,
+    box_majority,
+    box_sum,
+    check_bright,
+    decode_photo,
+    least_factor,
+    open_photo,
+    read_alpha,
+)
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
 from factorlib.labels.label_image import Labels, count_colours, read_labels, read_object_indices
@@ -53,6 +63,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     clipped.R/G/B   1 for clipped values.
     left_out        1 for pixels that are neither background nor a material.
     object          Number of the object, from 1, where objects have masks of their own; else 0.
+    alpha           Opacity, 0 to 1, of a cut-out; absent where all of the photo is opaque.
     """
     name = inputs.photo
     assert name is not None  # a stage over one photo
@@ -64,7 +75,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     height, width = opened.size
     check_pixels(opened.size, params.most_megapixels, path, f"{entry}.image")
     progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
-    labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, f"{entry}.masks")
+    labels = read_labels(facts.masks, inputs.file, facts.labels, opened.size, facts.image, f"{entry}.masks")
     object_masks = [(o.name, o.mask) for o in facts.objects]
     objects = read_object_indices(object_masks, inputs.file, opened.size, f"{entry}.objects")
     # smallest integer factor at which materials and frame fit their limits
@@ -74,7 +85,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     objects = box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
     photo = decode_photo(opened, facts.encoding, factor, path)
-    photo, labels, objects = undistort_photo(photo, labels, objects, facts, f"{entry}.camera.distortion")
+    planes = {"object": objects, **opacity(path, factor)}
+    photo, labels, planes = undistort_photo(photo, labels, planes, facts, f"{entry}.camera.distortion")
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
     if (processing := reported_processing(opened.exif)) and not is_raw(path):
         log.warning("%s: the camera processed it (%s): %s", path, processing, CURE)
@@ -84,7 +96,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     progress(2, 3, f"{name}: writing")
     colours = {c: photo.radiance[..., k] for k, c in enumerate("RGB")}
     clipped = {f"clipped.{c}": photo.clipped[..., k] for k, c in enumerate("RGB")}
-    channels = {"label": labels.label, "valid": valid, "left_out": labels.left_out, "object": objects}
+    channels = {"label": labels.label, "valid": valid, "left_out": labels.left_out, **planes}
     write_exr(out / f"{name}.exr", {**colours, **channels, **clipped})
     pixels = {material: int((labels.label[valid] == k).sum()) for k, material in enumerate(materials, 1)}
     write_json(out / f"{name}.json", photo_facts(photo, facts, (width, height), pixels, valid))
@@ -118,17 +130,23 @@ def photo_facts(
     )
 
 
+def opacity(path: Path, factor: int) -> dict[str, np.ndarray]:
+    """Return the channel `alpha` of a photo, averaged down, if some of its pixels are transparent."""
+    alpha = read_alpha(path)
+    return {} if alpha is None or alpha.min() == OPAQUE else {"alpha": box_sum(alpha, factor) / (OPAQUE * factor**2)}
+
+
 def undistort_photo(
-    photo: Photo, labels: Labels, objects: np.ndarray, facts: PhotoSlice, key: str
-) -> tuple[Photo, Labels, np.ndarray]:
+    photo: Photo, labels: Labels, planes: dict[str, np.ndarray], facts: PhotoSlice, key: str
+) -> tuple[Photo, Labels, dict[str, np.ndarray]]:
     """Remove the distortion that dataset.yaml gives; InputError if it is not invertible within the picture."""
     lens = radial_lens(facts.camera, photo.factor, photo.width, photo.height)
     if lens is None:
-        return photo, labels, objects
+        return photo, labels, planes
     lens.check(photo.width, photo.height, "dataset.yaml", key)
     pinhole = Undistortion(lens, photo.height, photo.width)
     labels = Labels(pinhole.resample_nearest(labels.label), pinhole.resample_nearest(labels.left_out) | ~pinhole.inside)
-    return pinhole.photo(photo), labels, pinhole.resample_nearest(objects)
+    return pinhole.photo(photo), labels, {name: pinhole.resample_nearest(plane) for name, plane in planes.items()}
 
 
 def reduce_labels(labels: Labels, factor: int, path: Path, key: str) -> Labels:

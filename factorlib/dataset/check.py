@@ -50,14 +50,6 @@ LEAST_OFF_LINE = 1e-3  # least distance of some keypoint from a line, in extents
 def check_dataset(spec: DatasetFile, file: Path) -> None:
     """Check dataset.yaml for consistency; InputError names file, key and cure of each fault."""
     refuse = Refusal(file, file.parent)
-    for index, name in enumerate(spec.materials):
-        refuse.collect(
-            refuse.refuse_if,
-            name in spec.materials[:index],
-            f"materials[{index}]",
-            f"material {name!r} is named twice",
-            "label k is the k-th material: name each once",
-        )
     for name, mesh in spec.meshes.items():
         refuse.collect(_check_mesh, name, mesh, spec, refuse)
     refuse.collect(refuse.check_distinct, "photos", (photo.name for photo in spec.photos), "photo")

@@ -154,7 +154,7 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
         cure = "write what belongs there, in place of `?`"
         faults.append(InputError(f"{number} left open: {_enumerate(places)}", file=file, key=places[0], cure=cure))
     try:
-        spec = convert(value, DatasetFile, file, text=text)
+        spec = with_parts_of_hulls(convert(value, DatasetFile, file, text=text))
     except InputError as error:
         raise_all(faults + _independent_faults(error, places))
     try:
@@ -162,6 +162,14 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     except InputError as error:
         faults += _independent_faults(error, places)
     return spec, faults
+
+
+def with_parts_of_hulls(spec: DatasetFile) -> DatasetFile:
+    """Return the dataset with a part of each material for hulls that have neither parts nor a material."""
+    parts = {name: name for name in spec.materials}
+    open_hulls = {name: mesh for name, mesh in spec.meshes.items() if mesh.hull and not mesh.part_materials}
+    filled = {name: msgspec.structs.replace(mesh, parts=parts) for name, mesh in open_hulls.items()}
+    return msgspec.structs.replace(spec, meshes=spec.meshes | filled)
 
 
 def _independent_faults(error: InputError, places: list[str]) -> list[InputError]:

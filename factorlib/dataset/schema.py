@@ -51,11 +51,11 @@ class MeshEntry(_Format, frozen=True):
     """A mesh in dataset.yaml: its file, or the kind of shape to estimate, and the materials of its parts.
 
     A part is an OBJ group or usemtl, or a glTF primitive or material.  Exactly one of file, hull, lathe and primitive
-    is given.
+    is given, and either parts or a material; a hull with neither has a part of each material.
 
     Attributes:
         file: the mesh file
-        hull: visual hull of the masks, for known cameras; its parts are named here and visible in the masks
+        hull: visual hull of the masks, for known cameras; its parts are visible in the masks
         lathe: body of revolution about y, from its outlines
         primitive: a primitive about y, with proportions from its outlines
         size: longest side of a lathe's or primitive's bounding box, in the unit of the set's meshes
@@ -245,7 +245,11 @@ class KnownQuantities(_Format, frozen=True):
 
 
 class DatasetFile(_Format, frozen=True):
-    """Content of dataset.yaml, key by key (docs/dataset.md)."""
+    """Content of dataset.yaml, key by key (docs/dataset.md).
+
+    Attributes:
+        materials: material of each label, from 1; labels of one name are one material
+    """
 
     format: Annotated[Literal[1], Meta(description="this version reads format: 1")]
     materials: Annotated[list[Name], OneOf254]
@@ -254,6 +258,11 @@ class DatasetFile(_Format, frozen=True):
     cameras: CameraSource | None = None
     known: KnownQuantities = KnownQuantities()
     truth: str | None = None
+
+    @property
+    def distinct_materials(self) -> list[str]:
+        """The materials, each once."""
+        return list(dict.fromkeys(self.materials))
 
 
 class GivenMaterial(_Format, frozen=True):
@@ -338,12 +347,14 @@ class PhotoSlice(msgspec.Struct, frozen=True):
     """Facts that the stage `masks` needs to read a photo and its masks.
 
     Attributes:
+        labels: material of each label of a mask, from 1
         camera: only for a lens with distortion
     """
 
     image: str
     encoding: Literal["srgb", "linear", "gamma2.2"] | None
     masks: Masks
+    labels: list[str]
     focal_px: float | None
     illumination: str
     objects: list[ObjectMask]

@@ -70,6 +70,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
         image=photo.image,
         encoding=photo.encoding,
         masks=photo.masks,
+        labels=dataset.spec.materials,
         focal_px=photo.camera.focal_px if photo.camera else None,
         illumination=photo.light,
         objects=[schema.ObjectMask(obj.name, obj.mask) for obj in photo.objects],
@@ -145,11 +146,11 @@ _PHOTO_SLICES: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]]
     "ground": lambda dataset, photo: (schema.GroundSlice(photo.ground), []),
 }
 _SET_SLICES: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
-    "materials": lambda dataset: (dataset.spec.materials, []),
+    "materials": lambda dataset: (dataset.spec.distinct_materials, []),
     "set": lambda dataset: (
         schema.SetSlice(
             dataset.name,
-            dataset.spec.materials,
+            dataset.spec.distinct_materials,
             dataset.spec.meshes,
             [photo.name for photo in dataset.spec.photos],
             dataset.up,

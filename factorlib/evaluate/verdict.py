@@ -26,6 +26,7 @@ from factorlib.evaluate.ball import OctahedralLight
 from factorlib.evaluate.picture_errors import tone_map
 from factorlib.evaluate.predicted_views import describe_views
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
+from factorlib.inference.identifiability import helpful_light
 from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, SolvedMaterial
 from factorlib.results.metrics import Trust, Verdict
@@ -88,6 +89,7 @@ class VerdictInputs(msgspec.Struct, frozen=True):
         deviation: deviation of the residuals in units of their noise, which scales the standard errors of materials
         overlaps: silhouette overlap (IoU) of each object, by photo and object
         surface: residual of photos that had no part in the surface, in units of their noise; None if it is not known
+        lit_hard: materials that a photo shows in light with a small bright source
     """
 
     materials: dict[str, float]
@@ -97,6 +99,7 @@ class VerdictInputs(msgspec.Struct, frozen=True):
     deviation: float = 1.0
     overlaps: dict[str, dict[str, float]] = {}
     surface: float | None = None
+    lit_hard: frozenset[str] = frozenset()
 
     def terms(self) -> dict[str, float]:
         """Return the four measured terms of (1) by name, all but FLOOR."""
@@ -155,8 +158,8 @@ def _explain_materials(inputs: VerdictInputs) -> tuple[str, str]:
     if inputs.deviation > DISAGREES:
         why += f", for shapes and photos disagree by {inputs.deviation:.0f} times their noise"
         return why, _explain_unexplained(inputs)[1]
-    bright = "in light with a small bright source, or in which it stands beside a material that is surer"
-    return why, f"add a photo of '{name}' {bright}"
+    light = helpful_light(name in inputs.lit_hard)
+    return why, f"add a photo of '{name}' {light}, or in which it stands beside a material that is surer"
 
 
 def _explain_clipped(inputs: VerdictInputs) -> tuple[str, str]:

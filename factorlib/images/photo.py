@@ -3,7 +3,7 @@
 Orientation   as displayed: the EXIF orientation is applied.
 Colours       those of the file's profile; without one, integers are sRGB-encoded, float and raw files linear, and
               primaries are Rec. 709's. `encoding` replaces the curve, not the primaries.
-Channels      one channel is grey; alpha is dropped.
+Channels      one channel is grey; alpha is read by itself.
 Clipped       integer codes from `scanlines.CLIPPED` of the range (254 of 255) on, and channels that the primaries mix
               such a code into; for a raw file, saturated sensor pixels. A float file has no top code; values that are
               not finite are invalid pixels.
@@ -21,7 +21,8 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+import OpenImageIO as oiio
+from jaxtyping import Bool, Float, Shaped, UInt16
 
 from factorlib.errors import InputError
 from factorlib.images.camera_files import is_heif, is_raw, open_heif, open_raw
@@ -32,6 +33,7 @@ from factorlib.images.tone import DECODERS
 from factorlib.reading import reading
 
 READ_AT_ONCE = 1 << 21  # number of pixels that are in memory as floats
+OPAQUE = 65535  # alpha of an opaque pixel
 VOTED_AT_ONCE = 1 << 21  # number of pixels of a strip
 
 
@@ -96,6 +98,18 @@ def read_photo(path: str | Path, encoding: str | None = None, key: str | None = 
         InputError: As `open_photo` does, and if the file is truncated.
     """
     return decode_photo(open_photo(path, key), encoding, 1, path)
+
+
+def read_alpha(path: Path) -> UInt16[np.ndarray, "h w"] | None:
+    """Return the alpha channel of a PNG or a TIFF as displayed, 0 to `OPAQUE`; None for a file without one."""
+    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+        return None
+    image = oiio.ImageBuf(str(path))
+    channel = image.spec().alpha_channel
+    if channel < 0:
+        return None
+    alpha = oiio.ImageBufAlgo.reorient(oiio.ImageBufAlgo.channels(image, (channel,)))
+    return np.asarray(alpha.get_pixels(oiio.UINT16))[..., 0]
 
 
 def check_bright(photo: Photo, mask: Bool[np.ndarray, "h w"], path: str | Path, key: str | None = None) -> None:

@@ -20,6 +20,7 @@ from factorlib.inference.gauge import LEAST_ENERGY, connected_components, has_fr
 from factorlib.inference.materials import REFLECTANCES, ROUGHNESS, Materials, Point
 from factorlib.inference.observed import PhotoObservations
 from factorlib.inference.problem import JointProblem
+from factorlib.light.lobes import is_hard
 from factorlib.robust import TINY
 
 FEW_OBSERVATIONS = 40  # observations: a few for each of 7 unknowns of a material and for the light that it mirrors
@@ -139,7 +140,7 @@ def after_solving(answer: Answer) -> list[str]:
     """Return sentences about quantities that the answer leaves open or explains badly."""
     problem = answer.solution.effective_problem(answer.problem)
     return [
-        *undetermined_by_answer(answer.names, problem, answer.solution.point.materials, answer.errors.materials),
+        *undetermined_by_answer(answer.names, problem, answer.solution.point, answer.errors.materials),
         *poorly_explained(problem, answer.radiance),
         *unlikely_curves(problem, answer.solution.point),
         *tinted_alike(problem, answer.solution.point),
@@ -148,22 +149,35 @@ def after_solving(answer: Answer) -> list[str]:
     ]
 
 
-def undetermined_by_answer(
-    names: Sequence[str], problem: JointProblem, estimate: Materials, errors: Materials
-) -> list[str]:
+def undetermined_by_answer(names: Sequence[str], problem: JointProblem, point: Point, errors: Materials) -> list[str]:
     """Return sentences about observed materials that the data leave uncertain.
 
     Args:
         names: Names of all materials, by number.
         problem: Observations.
-        estimate: Estimated materials.
-        errors: Their standard errors.
+        point: Estimated materials and lights.
+        errors: Standard errors of the materials.
     """
-    observed = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
-    return [sentence for m in observed for sentence in _error_warnings(names[m], estimate.rows()[m], errors.rows()[m])]
+    lit_hard: dict[int, bool] = {}
+    for block, light in zip(problem.blocks, point.lights, strict=True):
+        hard = is_hard(light.axis, light.energy.sum(1))
+        lit_hard |= {int(m): hard or lit_hard.get(int(m), False) for m in np.unique(block.material)}
+    estimates, deviations = point.materials.rows(), errors.rows()
+    return [
+        sentence
+        for m, hard in sorted(lit_hard.items())
+        for sentence in _error_warnings(names[m], estimates[m], deviations[m], hard)
+    ]
 
 
-def _error_warnings(name: str, estimate: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
+def helpful_light(lit_hard: bool) -> str:
+    """Return the light, in words, in which a photo tells more of a material that was seen in hard light, or was not."""
+    return "in another light" if lit_hard else "in light with a small bright source"
+
+
+def _error_warnings(
+    name: str, estimate: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"], lit_hard: bool
+) -> Iterator[str]:
     """Yield sentences about one material from its estimate and standard errors, both (k_d, k_s, roughness)."""
     reflectance = (estimate[:3] + estimate[3:REFLECTANCES]).max()
     *errors, roughness_error = error.tolist()
@@ -177,16 +191,16 @@ def _error_warnings(name: str, estimate: Float[np.ndarray, "7"], error: Float[np
     elif not largest <= SHARE_ERROR * reflectance:
         yield (
             f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {reflectance:.2g}: diffuse and "
-            "specular part look alike here. A photo in light with a small bright source, or next to a brighter "
-            "material, would help"
+            f"specular part look alike here. A photo {helpful_light(lit_hard)}, or next to a brighter material, would "
+            "help"
         )
     if not (specular.any() or error[3:REFLECTANCES].any()):  # k_s is known to be 0: roughness has no meaning
         return
     if not (roughness_error <= ROUGHNESS_ERROR and (specular > 2 * error[3:REFLECTANCES]).any()):
         yield (
             f"the roughness of material '{name}' cannot be determined (±{roughness_error:.2g}): no highlight "
-            "stands out, or shape and photos disagree too much. A photo in light with a small bright source, or a "
-            "better mesh, would help"
+            f"stands out, or shape and photos disagree too much. A photo {helpful_light(lit_hard)}, or a better mesh, "
+            "would help"
         )
     elif estimate[REFLECTANCES] <= ROUGHNESS[0] + 1e-9 and roughness_error > 0:
         yield (

@@ -101,7 +101,7 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
     for k, with_wide_lobe in zip(lamps, wide, strict=True):
         decision = compare_illuminations(with_wide_lobe[0], kept[k][0], CLEARLY_AGAINST)
         if not decision.accepted:
-            evidence[k] = decision
+            evidence[k] = msgspec.structs.replace(decision, share=evidence[k].share, warmth=evidence[k].warmth)
             del kept[k]
     lights = list(fit.point.lights)
     hyperparameters = list(fit.hyperparameters)
@@ -181,7 +181,9 @@ def accept_sun(cells: Illumination, sun: Illumination, share: float = 1.0) -> De
         evidence = compare_illuminations(cells, sun, share * WEAKLY_FOR)
         accepted = evidence.accepted and gains(evidence, share * LEAST_SUN_GAIN) and warmth(light) >= 0
     strong = sun_share(light) >= share * LEAST_SUN_SHARE
-    return msgspec.structs.replace(evidence, accepted=bool(accepted and strong))
+    return msgspec.structs.replace(
+        evidence, accepted=bool(accepted and strong), share=sun_share(light), warmth=warmth(light)
+    )
 
 
 def is_sunlight(light: Light, share: float = 1.0) -> bool:

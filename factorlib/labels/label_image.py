@@ -32,7 +32,7 @@ log = logging.getLogger("factorlib.labels")
 class Labels(msgspec.Struct, frozen=True):
     """Material labels of the pixels of a photo.
 
-    label      0 background, k the k-th material
+    label      0 background, k the k-th material; a material with several labels in dataset.yaml counts once
     left_out   True for pixels that are neither background nor a material, whose label is 0
     """
 
@@ -53,7 +53,7 @@ def read_labels(
     Args:
         masks: A label PNG, a json of COCO or labelme, or {material: PNG}, as in dataset.yaml.
         file: Function from such a name to a path.
-        materials: Materials of the dataset, in order.
+        materials: Material of each label, from 1; labels of one name are one material.
         size: Height and width of the photo as displayed.
         image: File name of the photo, for COCO.
         key: Key of `masks`, to name in errors.
@@ -65,13 +65,14 @@ def read_labels(
         InputError: If the masks are invalid or empty.
     """
     mask_file = file(masks if isinstance(masks, str) else next(iter(masks.values())))
+    names = list(dict.fromkeys(materials))
     if not isinstance(masks, str):
-        places = {name: (file(masks[name]), f"{key}.{name}") for name in sorted(masks, key=materials.index)}
+        places = {name: (file(masks[name]), f"{key}.{name}") for name in sorted(masks, key=names.index)}
         inside = {name: read_inside(*place, size) for name, place in places.items()}
-        labels = _merged(inside, materials, places, size, edge=0)
+        labels = _merged(inside, names, places, size, edge=0)
     elif masks.lower().endswith(".json"):
-        inside = read_coco(mask_file, image, materials, size, key)
-        labels = _merged(inside, materials, dict.fromkeys(inside, (mask_file, key)), size, edge=DRAWN_EDGE)
+        inside = read_coco(mask_file, image, names, size, key)
+        labels = _merged(inside, names, dict.fromkeys(inside, (mask_file, key)), size, edge=DRAWN_EDGE)
     else:
         folder = mask_file.parents[len(PurePosixPath(masks).parts) - 1]
         labelmap = labelmap_beside(masks, folder)
@@ -212,7 +213,9 @@ def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: lis
             cure=f"known are: 0 background, {known}, 255 leave out",
         )
     left_out = values == LEFT_OUT
-    return Labels(label=np.where(left_out, 0, values).astype(np.uint8), left_out=left_out)
+    names = list(dict.fromkeys(materials))
+    number = np.array([0, *(names.index(name) + 1 for name in materials)], np.uint8)
+    return Labels(label=number[np.where(left_out, 0, values)], left_out=left_out)
 
 
 def _merged(

@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float
 
 SMALL_SHARPNESS = 1e-3  # λ below which the integral is a series
 SUN_DEG = 0.53  # diameter of the sun's disc, degrees
+HARD_RADIUS = np.radians(15)  # of the region that holds `HARD_SHARE` of a light with a small bright source
+HARD_SHARE = 0.25  # the sun holds a quarter to two thirds of the light where it shines
 SUN = 4 / np.radians(SUN_DEG / 2) ** 2  # λ of the lobe whose RMS width is that of the disc
 
 
@@ -74,6 +76,17 @@ def lobe_energy(sharpness: float | Float[np.ndarray, "*p"]) -> Float[np.ndarray,
     safe = np.where(small, 1.0, sharpness)
     series = 2 - 2 * sharpness + 4 / 3 * sharpness**2
     return 2 * np.pi * np.where(small, series, -np.expm1(-2 * safe) / safe)
+
+
+def is_hard(axis: Float[np.ndarray, "p 3"], energy: Float[np.ndarray, " p"]) -> bool:
+    """Return True if a light has a small bright source, which casts hard shadows and shows in highlights.
+
+    Args:
+        axis: Directions of its lobes.
+        energy: Energy of each lobe.
+    """
+    near = axis @ axis.T > np.cos(HARD_RADIUS)
+    return bool((near @ energy).max(initial=0) > HARD_SHARE * energy.sum())
 
 
 def no_lobes() -> Lobes:

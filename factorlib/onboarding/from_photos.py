@@ -465,7 +465,8 @@ def label_parts(
     shares = ", ".join(f"label_{k} {share:.0%}" for k, share in enumerate(surface.shares, start=1))
     return [
         f"{len(surface.shares)} parts by colour are proposed as materials ({shares} of the surface): look at the "
-        "contact sheet and give them names in dataset.yaml; WHOLE=1 takes the thing for one material"
+        "contact sheet and give them names in dataset.yaml, two that are one material the same name; WHOLE=1 takes the "
+        "thing for one material"
     ]
 
 

@@ -9,12 +9,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from scipy import ndimage
 
 from factorlib.errors import InputError
+from factorlib.images.photo import read_alpha
 from factorlib.labels.mask_files import opaque_part
 from factorlib.reading import reading
 
@@ -31,14 +31,8 @@ Matte = Float[np.ndarray, "h w"]
 
 def opaque_pixels(path: Path) -> Bool[np.ndarray, "h w"] | None:
     """Return the opaque pixels of a photo as displayed; None if it has no alpha channel, or one that hides nothing."""
-    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        return None
-    image = oiio.ImageBuf(str(path))
-    channel = image.spec().alpha_channel
-    if channel < 0:
-        return None
-    alpha = oiio.ImageBufAlgo.reorient(oiio.ImageBufAlgo.channels(image, (channel,)))
-    return opaque_part(np.asarray(alpha.get_pixels(oiio.UINT16))[..., 0])
+    alpha = read_alpha(path)
+    return None if alpha is None else opaque_part(alpha)
 
 
 def foreground(matte: Matte) -> Bool[np.ndarray, "h w"]:

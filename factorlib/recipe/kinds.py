@@ -69,15 +69,21 @@ class ResynthesisRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="resynthesis
     """Recipe of a photo with its objects replaced by path-traced ones."""
 
 
-class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
-    """Recipe of the objects from another view: the camera moves about their middle, and the light stays."""
+class ViewedRecipe(BackgroundRecipe, frozen=True, kw_only=True):
+    """Fields of recipes whose camera moves about the middle of the objects."""
 
-    azimuth: Degrees = 30.0
+    azimuth: Degrees = 0.0
     """Angle about the camera's upright axis, to the right in the photo."""
     elevation: Annotated[float, msgspec.Meta(ge=-89, le=89)] = 0.0
     """Angle upward, relative to the photo's camera."""
     zoom: Factor = 1.0
     """Magnification of the objects in the picture."""
+
+
+class ViewRecipe(ViewedRecipe, frozen=True, kw_only=True, tag="view"):
+    """Recipe of the objects from another view; the light stays."""
+
+    azimuth: Degrees = 30.0
 
 
 class TurntableRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="turntable"):
@@ -98,8 +104,8 @@ class MovingLightRecipe(ResizedRecipe, frozen=True, kw_only=True, tag="moving_li
     """Duration of the whole turn."""
 
 
-class RelightRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="relight"):
-    """Recipe of the photo's objects in other lights."""
+class RelightRecipe(ViewedRecipe, frozen=True, kw_only=True, tag="relight"):
+    """Recipe of the photo's objects in other lights, from the photo's view or from another."""
 
     lights: list[str] = []
     """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); by default the first photo of

@@ -348,9 +348,10 @@ class TracedPicture(msgspec.Struct, frozen=True):
         """The display exposure for the covered pixels."""
         return exposure_of(self.display_radiance, self.pixels[..., 3] > 0.5)
 
-    def with_exposure(self) -> TracedPicture:
-        """Return the picture times its own exposure, without a tone curve."""
-        return TracedPicture(self.pixels * np.array([self.exposure] * 3 + [1.0]))
+    def with_exposure(self, exposure: float | None = None) -> TracedPicture:
+        """Return the picture times an exposure, by default its own, without a tone curve."""
+        exposure = self.exposure if exposure is None else exposure
+        return TracedPicture(self.pixels * np.array([exposure] * 3 + [1.0]))
 
     def composite_over(self, photo: Radiance) -> Radiance:
         """Composite the picture, after its tone curve, over a photo."""

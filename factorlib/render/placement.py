@@ -2,7 +2,8 @@
 
 Two meshes intersect if an edge of one crosses a triangle of the other, or if one lies within the other.  A new object
 that would intersect an existing one moves along the ground.  It moves to the nearest place where it is free and at
-least half of it is visible.  Candidate places form a lattice on the ground with a spacing of a tenth of the object's
+least half of it is visible.  One whose place nobody asked for also moves if the picture's border would cut it, to where
+all of it is in the picture.  Candidate places form a lattice on the ground with a spacing of a tenth of the object's
 height. If none within eight heights is free, a coarser lattice follows.
 """
 
@@ -31,6 +32,7 @@ STEP = 0.1  # spacing of candidate places, in heights
 COARSER = 8  # factor on spacing and radius if the first lattice has no free place
 ENOUGH = 500  # vertices of the new object that are tested for visibility
 LEAST_VISIBLE = 0.5  # least share of the new object's vertices that are visible at the place it is moved to
+CUT = "The picture's border cuts the new object: make it smaller (`size`), or name another place, `at: [x, y]`."
 
 
 class Spot(msgspec.Struct, frozen=True):
@@ -194,8 +196,11 @@ class FreeSpace:
         hidden = [other.crosses(np.zeros_like(inside), inside) for other in self.others]
         return len(inside) / len(points), float((~np.any(hidden, axis=0)).sum()) / len(points)
 
-    def nearest_move(self) -> Float[np.ndarray, "3"] | None:
-        """Return the shortest move to a place where the object is free and visible; None if there is none."""
+    def nearest_move(self, whole: bool = False) -> Float[np.ndarray, "3"] | None:
+        """Return the shortest move to a place where the object is free and visible; None if there is none.
+
+        Only places within RADIUS count where all of the object must be in the picture (`whole`).
+        """
         plane = self.spot.plane
         every = max(1, len(self.new.vertices) // ENOUGH)
         # lattice of moves on the ground, nearest first
@@ -204,8 +209,10 @@ class FreeSpace:
         distance = np.linalg.norm(lattice, axis=1)
         order = np.argsort(distance, kind="stable")[: (distance <= RADIUS * self.spot.height).sum()]
         finest = lattice[order] @ rotation_between(np.array([0.0, 1.0, 0.0]), plane.normal).T
-        for moves in (finest, COARSER * finest):
+        for moves in (finest,) if whole else (finest, COARSER * finest):
             for move in moves[self._in_picture(self.spot.point + moves)]:
+                if whole and not self._in_picture(self.new.vertices + move).all():
+                    continue
                 if self.visible_shares(move, every)[1] >= LEAST_VISIBLE and not any(self.intersected(move)):
                     return move
         return None
@@ -239,7 +246,8 @@ def free_placement(
         factor: pixels of the photo per pixel of the scene's camera
 
     Returns:
-        The object, its spot, and a sentence about the displacement and its reason (empty if it did not move).
+        The object, its spot, and sentences about the displacement and its reason, and about a cut by the picture's
+        border (empty if it is whole and did not move).
 
     Raises:
         InputError: There is no free place, or the object would be invisible at the place that the recipe names.
@@ -248,12 +256,18 @@ def free_placement(
     space = FreeSpace(scene, new, spot)
     intersected = list(space.intersected())
     inside, visible = space.visible_shares()
-    if not intersected and visible > 0:
-        return new, spot, ""
+    is_free = not intersected and visible > 0
+    stays = is_free and (is_requested or inside == 1)
+    move = None if stays else space.nearest_move(whole=True)
+    if is_free and move is None:
+        return new, spot, CUT if inside < 1 else ""
     reason = "it would be hidden behind other objects" if inside else "it would be outside the picture"
     if intersected:
         reason = f"it would intersect {' and '.join(intersected)}"
-    if (move := space.nearest_move()) is None:
+    elif is_free:
+        reason = "the picture's border would cut it"
+    move = space.nearest_move() if move is None else move
+    if move is None:
         cure = "name another photo, object or place"
         for share in (0.5, 0.25, 0.125):
             small = msgspec.structs.replace(spot, height=share * spot.height)
@@ -269,4 +283,4 @@ def free_placement(
     free = msgspec.structs.replace(spot, point=spot.point + move)
     heights = np.linalg.norm(move) / spot.height
     moved = f"The new object was moved by {heights:.1f} of its heights, to {place}, because {reason}."
-    return stand(free), free, moved
+    return stand(free), free, moved if space.visible_shares(move)[0] == 1 else f"{moved} {CUT}"

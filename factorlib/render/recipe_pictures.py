@@ -18,14 +18,14 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
-from factorlib.images.picture import picture, write_gif, write_png
+from factorlib.images.picture import exposure_of, picture, write_gif, write_png
 from factorlib.images.tone import srgb_decode, srgb_encode
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import without_paint
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import AnyRecipe, is_light_file
 from factorlib.render.ground import floor_rim, height_over, on_floor
-from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compare_shadow, insert_object
+from factorlib.render.insertion import LUMINANCE, NEW, GroundSurface, InsertionScene, compare_shadow, insert_object
 from factorlib.render.photo_scene import (
     Orbit,
     PhotoScene,
@@ -85,7 +85,12 @@ def add_grain(radiance: Picture, photo: Picture, share: Float[np.ndarray, "h w"]
 
 
 log = logging.getLogger("factorlib.recipes")
+METERED = 4  # samples per pixel of the mask of objects by which a picture is exposed
 CONTRADICTED = "the ground that the photo shows is not shaded as the recovered light predicts"
+CUT_OUT = (
+    "The photo is a cut-out, which shows no ground: the shadow is in the picture's alpha, to be laid over a ground of "
+    "your own."
+)
 PEDESTAL = " (if the photo's objects stand above the floor, lower the ground: `ground: {drop: …}`)"
 
 
@@ -163,7 +168,11 @@ def write_resynthesis(
         scene = msgspec.structs.replace(scene, objects=tuple(objects), materials=materials)
     traced = TracedPicture(traced_photo(scene, recipe.samples), results.tone(photo))
     background = results.photo(photo)
-    _write_opaque(out / photo, add_grain(traced.composite_over(background), background, traced.coverage[..., 0]))
+    opacity = results.opacity(photo)
+    coverage = traced.coverage[..., 0]
+    alpha = 1 - (1 - coverage) * (1 - opacity)
+    radiance = straight(traced.composite_over(background * opacity[..., None]), alpha)
+    _write_over_photo(out / photo, add_grain(radiance, background, coverage), alpha)
 
 
 def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) -> InsertionScene:
@@ -234,23 +243,30 @@ def write_insertion(
     insertion = insertion_scene(recipe, results, photo)
     if insertion.moved:
         log.warning("%s: %s", photo, insertion.moved)
-    linear = results.linear_photo(photo)
+    opacity = results.opacity(photo)
+    linear = results.linear_photo(photo) * opacity[..., None]
     covered = results.photo_mask(photo)
     result = insert_object(insertion, linear, covered, recipe.samples)
     match = compare_shadow(insertion, result, linear, covered)
+    cut_out = CUT_OUT if opacity.min() < 1 else ""
+    if cut_out:
+        log.warning("%s: %s", photo, cut_out)
     hint = PEDESTAL if match.doubtful and recipe.ground.drop == 0 and results.grounds[photo].ground is None else ""
     if match.doubtful:
         log.warning("%s: do not trust the shadow: %s%s", photo, CONTRADICTED, hint)
     # Pixels that the new object does not change keep the photo's values exactly.
-    edited = np.where(result.composite == linear, results.photo(photo), results.tone(photo)(result.composite))
-    _write_opaque(out / photo, add_grain(edited, results.photo(photo), result.coverage))
+    # Where the photo is transparent, the shadow s lets the share s of what lies behind through.
+    through = (1 - result.coverage) * (1 - opacity) * np.minimum(result.shadow @ LUMINANCE, 1)
+    radiance = results.tone(photo)(straight(result.composite, 1 - through))
+    edited = np.where(result.composite == linear, results.photo(photo), radiance)
+    _write_over_photo(out / photo, add_grain(edited, results.photo(photo), result.coverage), 1 - through)
     pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
     moved = np.linalg.norm(insertion.spot.point - insertion.requested.point) / insertion.spot.height
     return {
         "at": pixel.round(1).tolist(),
         "moved": float(moved),
         "shadow": msgspec.to_builtins(match),
-        "caption": f"{insertion.moved} The ground is {insertion.ground.source}. {match}{hint}".strip(),
+        "caption": f"{insertion.moved} The ground is {insertion.ground.source}. {match}{hint} {cut_out}".strip(),
     }
 
 
@@ -281,36 +297,59 @@ def framed_scene(
 
 
 def render_view(
-    recipe: kinds.BackgroundRecipe,
-    results: SolvedSet,
-    photo: str,
-    scene: PhotoScene,
-    view: View = Orbit().world_from_camera,
+    recipe: kinds.BackgroundRecipe, results: SolvedSet, photo: str, scene: PhotoScene, view: View
 ) -> Float[np.ndarray, "h w 4"]:
-    """Render the objects from another view, over the environment map or a transparent background.
+    """Render the objects as `trace_view` does, before the light if the recipe requests that."""
+    traced, pose = trace_view(recipe, results, photo, scene, view)
+    return before_light(traced, scene, pose) if recipe.background == "light" else traced
 
-    They stand on a floor if the recipe requests one.
+
+def trace_view(
+    recipe: kinds.BackgroundRecipe, results: SolvedSet, photo: str, scene: PhotoScene, view: View
+) -> tuple[Float[np.ndarray, "h w 4"], Float[np.ndarray, "4 4"]]:
+    """Render the objects from another view, on a floor if the recipe requests one.
 
     The camera moves about the normal of the floor, or about the upright axis if there is no floor.
 
     Args:
-        recipe: background, floor and samples of the picture
+        recipe: floor and samples of the picture
         results: the solved data set
         photo: name of the photo
         scene: the photo's scene
         view: returns the pose of the camera for a scene and the unit axis of the azimuth
 
     Returns:
-        Linear radiance times coverage, and coverage.
+        Linear radiance times coverage, and coverage; and the pose of the camera.
     """
     if recipe.floor is None:
         pose = view(scene)
-        traced = traced_photo(scene, recipe.samples, pose)
-    else:
-        plane = results.ground(photo, scene.objects[0]).plane
-        pose = view(scene, plane.normal)
-        traced = on_floor(scene, plane, recipe.floor, recipe.samples, pose)
-    return before_light(traced, scene, pose) if recipe.background == "light" else traced
+        return traced_photo(scene, recipe.samples, pose), pose
+    plane = results.ground(photo, scene.objects[0]).plane
+    pose = view(scene, plane.normal)
+    return on_floor(scene, plane, recipe.floor, recipe.samples, pose), pose
+
+
+def meter(
+    traced: Float[np.ndarray, "h w 4"], scene: PhotoScene, pose: Float[np.ndarray, "4 4"], floor: float | None
+) -> float:
+    """Return the exposure of the objects in a picture, at which a floor is no brighter than the grey that it is.
+
+    A hard sun on a floor beside dark objects would otherwise burn it out.
+    """
+    whole = TracedPicture(traced)
+    if not floor:
+        return whole.exposure
+    alone = traced_photo(scene, METERED, pose)[..., 3]
+    exposure = exposure_of(whole.display_radiance, alone > 0.5)
+    shows_floor = (alone == 0) & (traced[..., 3] > 0.5)
+    return min(exposure, floor * exposure_of(whole.display_radiance, shows_floor)) if shows_floor.any() else exposure
+
+
+def viewed_scene(recipe: kinds.ViewedRecipe, results: SolvedSet, photo: str) -> tuple[PhotoScene, View, dict[str, Any]]:
+    """Return the photo's scene as the recipe's camera frames it, the view of that camera, and the crop."""
+    view: View = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
+    scene, crop = framed_scene(recipe, results, photo, results.scene(photo), [view])
+    return scene, view, crop
 
 
 def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
@@ -326,8 +365,7 @@ def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Pa
     Returns:
         The crop.
     """
-    view = Orbit(recipe.azimuth, recipe.elevation, recipe.zoom).world_from_camera
-    scene, crop = framed_scene(recipe, results, photo, results.scene(photo), [view])
+    scene, view, crop = viewed_scene(recipe, results, photo)
     traced = render_view(recipe, results, photo, scene, view)
     _write_transparent(out / photo, TracedPicture(traced, results.tone(photo)))
     return crop
@@ -383,14 +421,19 @@ def write_relit(
     Returns:
         The crop, and a caption with the frame in which maps stand.
     """
-    scene, crop = framed_scene(recipe, results, photo, results.scene(photo), STILL)
+    scene, view, crop = viewed_scene(recipe, results, photo)
     lights = recipe.lights or results.other_lights(photo)
     for k, name in enumerate(lights):
         report(k / len(lights))
         lit = msgspec.structs.replace(scene, light=rotate_light(results.light(name, photo), recipe.rotate, scene.up))
-        traced = render_view(recipe, results, photo, lit)
-        file = is_light_file(name)
-        relit = TracedPicture(traced).with_exposure() if file else TracedPicture(traced, results.tone(name))
+        traced, pose = trace_view(recipe, results, photo, lit, view)
+        exposure = meter(traced, lit, pose, recipe.floor) if is_light_file(name) else None
+        traced = before_light(traced, lit, pose) if recipe.background == "light" else traced
+        relit = (
+            TracedPicture(traced, results.tone(name))
+            if exposure is None
+            else TracedPicture(traced).with_exposure(exposure)
+        )
         _write_transparent(out / photo / Path(name).stem, relit)
     if not any(map(is_light_file, lights)):
         return crop
@@ -410,8 +453,15 @@ WRITERS: dict[type, Callable[[Any, SolvedSet, str, Path, Report], dict[str, Any]
 }
 
 
-def _write_opaque(stem: Path, radiance: np.ndarray) -> None:
-    """Write an opaque picture as EXR and PNG, at the photo's own exposure."""
+def straight(premultiplied: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+    """Return colours with alpha divided out, black where it is 0."""
+    return premultiplied / np.where(alpha > 0, alpha, 1)[..., None]
+
+
+def _write_over_photo(stem: Path, radiance: np.ndarray, alpha: np.ndarray) -> None:
+    """Write a picture over a photo as EXR and PNG at the photo's own exposure, opaque unless the photo is a cut-out."""
+    if alpha.min() < 1:
+        return _write_transparent(stem, TracedPicture(np.dstack([radiance * alpha[..., None], alpha])))
     stem.parent.mkdir(parents=True, exist_ok=True)
     write_rgb_exr(stem.with_name(stem.name + ".exr"), radiance)
     write_png(stem.with_name(stem.name + ".png"), picture(radiance, 1.0))

@@ -122,9 +122,14 @@ class SolvedSet:
         return pixel[0] / factor, pixel[1] / factor
 
     def photo_mask(self, photo: str) -> Bool[np.ndarray, "h w"]:
-        """Return a mask of the pixels that are not background."""
+        """Return a mask of the pixels that show no background: those of a mask, and those that are transparent."""
         channels = self._masks(photo)
-        return (channels["label"] > 0) | (channels["left_out"] > 0)
+        return (channels["label"] > 0) | (channels["left_out"] > 0) | (self.opacity(photo) < 1)
+
+    def opacity(self, photo: str) -> Float[np.ndarray, "h w"]:
+        """Return the opacity of the photo's pixels, which is less than 1 in a cut-out."""
+        channels = self._masks(photo)
+        return channels.get("alpha", np.ones(channels["label"].shape))
 
     def tone(self, photo: str) -> Tone:
         """Return the photo's tone curve."""

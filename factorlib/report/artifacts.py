@@ -27,10 +27,11 @@ from factorlib.results.texture_table import (
 
 STAGES = [
     "masks",
+    "shapes",
     "align",
     "urm",
-    "surface",
     "train",
+    "surface",
     "solve",
     "shading",
     "texture",

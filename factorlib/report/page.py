@@ -19,6 +19,7 @@ from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import data_uri, read_png
 from factorlib.images.tone import srgb_encode
+from factorlib.inference.suns import LEAST_SUN_SHARE
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
 from factorlib.results.materials import Reflectance
@@ -201,6 +202,7 @@ def _facts(run: Artifacts, metrics: Metrics) -> dict[str, Any]:
         "doubted": any(obj.doubts or obj.left_out for photo in poses.values() for obj in photo.objects.values()),
         "low_iou": LOW_IOU,
         "lights": list(filter(None, lights)),
+        "least_sun_share": LEAST_SUN_SHARE,
         "missing": {why: [name for _, name in group] for why, group in groupby(reasons, itemgetter(0))},
     }
 

@@ -286,6 +286,7 @@ def light_row(
     energy: share of the light's energy above white
     known: share of the sphere where the standard error is below the radiance
     known_uri: standard error over radiance r as grey 1 / (1 + r): white for none, mid-grey for 1
+    sun: the decision on a sun; None if none was looked for
 
     Args:
         run: results of the run
@@ -311,6 +312,7 @@ def light_row(
         "energy": float((energy * over).sum() / max(energy.sum(), 1e-30)),
         "true_uri": None if true is None else _true_map(true, radiance, exposure),
         "known_uri": None, "known": None, "spheres": _spheres(run, name),
+        "sun": run.solved.model.suns_chosen_by.get(name),
     }  # fmt: skip
     if known is not None:
         # standard error relative to the radiance of each texel

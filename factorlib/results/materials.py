@@ -155,6 +155,8 @@ class Decision(msgspec.Struct, frozen=True):
         log_bayes_factor: log marginal likelihood with it, less that without it
         correlation: of shadows on the ground, predicted by the objects alone and observed
         width: factor on the errors of a background, which is more than 1 where the objects contradict it
+        share: share of the light that a sun holds, or would hold
+        warmth: logarithm of red over blue of a sun, less that of the rest of the light
     """
 
     accepted: bool = msgspec.field(name="kept")
@@ -164,6 +166,8 @@ class Decision(msgspec.Struct, frozen=True):
     log_bayes_factor: float | None = None
     correlation: float | None = None
     width: float | None = None
+    share: float | None = None
+    warmth: float | None = None
 
 
 class WarmStart(msgspec.Struct, frozen=True):

@@ -204,6 +204,13 @@ def test_advice_blames_outlines_only_where_they_differ_and_then_what_photos_disa
     assert result.terms == verdict(msgspec.structs.replace(CLEAN, unexplained=1.0, photos=UNEXPLAINED)).terms
 
 
+def test_a_small_bright_source_is_asked_for_only_where_a_material_was_not_seen_in_one():
+    uncertain = msgspec.structs.replace(CLEAN, materials=WORSE["materials"])
+    assert "photo of 'wood' in light with a small bright source" in verdict(uncertain).next
+    for seen, words in (({"wood"}, "photo of 'wood' in another light"), ({"red"}, "a small bright source")):
+        assert words in verdict(msgspec.structs.replace(uncertain, lit_hard=frozenset(seen))).next
+
+
 def test_a_surfaces_disagreement_is_the_residual_of_photos_that_had_no_part_in_what_is_kept():
     moved, painted = DetailEvidence(4.0, 9.0), DetailEvidence(1.0, 4.0)
     tables = [(SurfaceTable(True, moved, True, painted), 1.0), (SurfaceTable(True, moved, False, painted), 2.0)]

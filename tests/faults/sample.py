@@ -361,7 +361,15 @@ def with_cameras(source: str, **more: str):
 def run_masks(folder: Path, name: str) -> None:
     """The stage `masks` of a photo, whose image, mask or mask of an object is the file."""
     image = "7.png" if name == "mask.png" else name
-    photo = PhotoSlice(image=image, encoding=None, masks="mask.png", focal_px=None, illumination="a", objects=[])
+    photo = PhotoSlice(
+        image=image,
+        encoding=None,
+        masks="mask.png",
+        labels=["red", "wood"],
+        focal_px=None,
+        illumination="a",
+        objects=[],
+    )
     files = {path.name: path for path in folder.iterdir() if path.is_file()}
     facts = {"dataset.photo": msgspec.to_builtins(photo), "dataset.materials": DATASET["materials"]}
     (folder / "out").mkdir(exist_ok=True)

@@ -251,7 +251,7 @@ def solved(scene: Scene, choices: SolveOptions) -> tuple[JointProblem, Solution,
     errors, _ = estimate_uncertainty(solution, problem, choices)
     sentences = undetermined_by_observations(names, problem)
     sentences += poorly_explained(problem, solution.effective_problem(problem).radiance(solution.point))
-    sentences += undetermined_by_answer(names, problem, solution.point.materials, errors.materials)
+    sentences += undetermined_by_answer(names, problem, solution.point, errors.materials)
     return problem, solution, sentences
 
 

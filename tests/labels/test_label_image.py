@@ -52,6 +52,17 @@ def coco(folder, annotations, images=None, categories=MATERIALS):
     return "coco.json"
 
 
+def test_labels_of_one_name_are_one_material(tmp_path):
+    names = ["white", "red", "white", "wood"]
+    save(tmp_path / "a.png", np.where(LABEL == 1, 2, LABEL) + LABEL // 3)  # 2 and 4
+    save(tmp_path / "b.png", LABEL)  # 1 and 3
+    split = [labels(tmp_path, name, materials=names).label for name in ("a.png", "b.png")]
+    by_name = {"wood": save(tmp_path / "c.png", LABEL == 3), "white": save(tmp_path / "d.png", LABEL == 1)}
+    assert np.array_equal(split[0], np.where(LABEL == 1, 2, LABEL))
+    assert np.array_equal(split[1], LABEL > 0)
+    assert np.array_equal(labels(tmp_path, by_name, materials=names).label, LABEL)
+
+
 def rle(counts, size=(H, W)):
     return {"size": list(size), "counts": counts}
 

@@ -11,7 +11,7 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.latlong import lat_long_of_lobes, map_energy, sample_map
-from factorlib.light.lobes import Lobes, lobe_energy, no_lobes
+from factorlib.light.lobes import Lobes, is_hard, lobe_energy, no_lobes
 from factorlib.light.prior import MIX, LightPrior, read_light_prior
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
 from factorlib.results.lobe_table import read_lobes, write_lobes
@@ -31,6 +31,15 @@ def some_lobes(count: int = 6, seed: int = 0) -> Lobes:
 def test_integral_is_the_quadrature_over_the_cosine(sharpness):
     expected = 2 * np.pi * quad(lambda t: np.exp(sharpness * (t - 1)), -1, 1)[0]
     assert lobe_energy(sharpness) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_light_is_hard_where_a_small_cone_holds_a_quarter_of_it():
+    axis = fibonacci_sphere(400)
+    even = np.ones(400)
+    for share, hard in ((0.2, False), (0.3, True)):
+        lamp = np.where(axis @ axis[7] > np.cos(np.radians(8)), 1.0, 0)
+        assert is_hard(axis, (1 - share) * even / even.sum() + share * lamp / lamp.sum()) == hard
+    assert not is_hard(np.zeros((0, 3)), np.zeros(0)) and not is_hard(axis, 0 * even)
 
 
 def test_table_round_trip_is_exact_and_byte_equal(tmp_path):

@@ -37,7 +37,16 @@ from factorlib.render.photo_scene import (
     traced_photo,
     visible_window,
 )
-from factorlib.render.placement import STEP, Spot, free_placement, spot_beside, standing_mesh, unproject_spot
+from factorlib.render.placement import (
+    CUT,
+    STEP,
+    FreeSpace,
+    Spot,
+    free_placement,
+    spot_beside,
+    standing_mesh,
+    unproject_spot,
+)
 from factorlib.results.materials import Reflectance
 from factorlib.tracing import scene as tracing
 from factorlib.tracing.scene import bsdf, render_scene, rigid, sensor, transform
@@ -420,6 +429,7 @@ def floor() -> dict:
 
 
 LOW, UP = Plane(np.array([0, 1.0, 0]), np.array([0, -1.0, -6])), np.array([0, 1.0, 0])
+DOWN = Plane(np.array([0, 0, 1.0]), np.array([0, 0, -6.0]))  # the camera looks straight down on it
 
 
 def at(mesh: Mesh, place, size=1.0, turn=None) -> PlacedMesh:
@@ -457,6 +467,20 @@ def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
     assert words == "" and there is spot and new.vertices[:, 1].min() == pytest.approx(-1.0)
 
 
+@pytest.mark.parametrize("plane, y, height", [(LOW, -1.0, 0.8), (DOWN, 0.0, 5.0)])
+def test_an_object_whose_place_nobody_asked_for_is_whole_in_the_picture_or_said_to_be_cut(plane, y, height):
+    """The picture ends in the middle of the requested spot; seen from above, the larger object fits nowhere."""
+    x = 6.0 * CAMERA.width / 2 / CAMERA.focal
+    spot, scene = Spot(plane, np.array([x, y, -6.0]), height), scene_of(at(sphere(0.2), (-4, -0.8, -6)))
+    shares = FreeSpace(scene, stand(spot), spot).visible_shares()
+    assert 0 < shares[1] <= shares[0] < 0.8
+    new, there, words = free_placement(scene, stand, spot, is_requested=False)
+    whole = FreeSpace(scene, new, there).visible_shares()[0] == 1
+    assert whole == ("because the picture's border would cut it" in words) == (CUT not in words) == (height < 1)
+    asked = free_placement(scene, stand, spot, is_requested=True)
+    assert asked[1] is spot and asked[2] == CUT
+
+
 WALL = PlacedMesh(
     "wall", box(2, 2, 2), ("grey",), np.diag([1.0, 1.0, 0.1, 1.0]) + np.outer([0, 0, -4.5, 0], [0, 0, 0, 1])
 )
@@ -480,8 +504,7 @@ def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked
 
 def test_an_object_that_fits_nowhere_is_refused_with_a_size_that_does():
     """The camera looks straight down on the ground."""
-    down = Plane(np.array([0, 0, 1.0]), np.array([0, 0, -6.0]))
-    spot = Spot(down, down.point, 20.0)
+    spot = Spot(DOWN, DOWN.point, 20.0)
     error = refusal(
         "no free place in the picture: it would intersect 'there' and the camera",
         free_placement,

@@ -9,19 +9,23 @@ from html.parser import HTMLParser
 import msgspec
 import numpy as np
 import pytest
+import yaml
 
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
+from factorlib.report.artifacts import STAGES
 from factorlib.report.page import sentences
 from factorlib.report.pictures import downsample
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import (
+    Decision,
     FitStatus,
     Model,
     read_materials,
 )
 from factorlib.results.texture_table import DetailEvidence, Exchange, TextureEvidence, TextureTable
+from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs
 from stages import evaluate, report
 from tests.evaluate.made_artifacts import Made, lobes_of, make_artifacts
@@ -204,6 +208,40 @@ def test_the_first_number_is_of_a_photo_that_was_held_out_and_reflectances_are_t
     for name, each in halved.items():
         shown = "  ".join(f"{value:.3f}" for value in each.diffuse)
         assert shown in page and "  ".join(f"{value:.3f}" for value in table.materials[name].diffuse) not in page
+
+
+def test_the_two_numbers_of_a_held_out_photo_say_how_they_are_exposed(report_page):
+    folder, _, html = report_page
+    metrics = read_json(folder / "evaluate" / "metrics.json")
+    tile = f"{metrics['views']['dusk']['predicted']:.1f}"
+    other = f"{metrics['held_out']['mean']['none']['estimate']['psnr_tonemapped_db']:.1f}"
+    table, views = (html.split(f'<h3 id="table-{key}">')[1] for key in ("held_out", "views"))
+    assert f"<td>{other}</td>" in table and "PSNR here is at the white of the photo" in table.split("<table")[0]
+    assert f"<td>{tile}</td>" in views and "The numbers at the top of the page" in views.split("<table")[0]
+
+
+def test_the_cost_table_knows_every_stage_of_the_pipeline():
+    stages = list(yaml.safe_load((LIBRARY / "pipeline.yaml").read_text())["stages"])
+    assert [name for name in stages if name not in ("report", "recipes")] == STAGES
+
+
+@pytest.mark.parametrize("accepted, words", [
+    (True, "It has a sun, which holds 12 % of the light"),
+    (False, "A sun was looked for and refused: it would hold 12 % of the light (it needs 7 %), in red over blue 0.5 times that "
+            "of the rest (1), and the photos are 0.4 standard errors against it"),
+])  # fmt: skip
+def test_a_light_says_of_its_sun_what_was_found_or_why_it_was_refused(report_page, tmp_path, accepted, words):
+    _, inputs, html = report_page
+    assert "A sun was looked for" not in html and "It has a sun" not in html
+    shutil.copytree(inputs["solve"], tmp_path / "solve")
+    table = read_materials(tmp_path / "solve" / "materials.json")
+    sun = Decision(accepted, 1.01, 1.0, -0.4, share=0.12, warmth=float(np.log(0.5)))
+    model = msgspec.structs.replace(table.model, suns_chosen_by={"day": sun, "noon": Decision(False)})
+    write_json(tmp_path / "solve" / "materials.json", msgspec.structs.replace(table, model=model))
+    changed = msgspec.structs.replace(inputs, folders=inputs.folders | {"solve": tmp_path / "solve"})
+    page = re.sub(r"\s+", " ", page_of(changed, tmp_path / "report"))
+    assert page.count(words) == 1 and ("assume a <code>sun</code> in recipes" in page) != accepted
+    parsed(page)
 
 
 @pytest.mark.parametrize("kept", [True, False])

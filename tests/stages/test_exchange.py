@@ -14,9 +14,9 @@ from factorlib.jsonfile import read_result, write_json
 from factorlib.light.lobes import Lobes
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.texture_table import EXCHANGE_FILE, REPLACED, Exchange, TextureTable, read_table, with_exchange
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from stages import exchange, shading
-from tests.stages.made import ran
+from tests.stages.made import Rising, ran
 from tests.stages.test_texture import TURNS, photographed, run, stripes
 
 
@@ -98,6 +98,7 @@ def test_a_photo_that_rejoins_is_solved_with_the_others_from_their_answer_withou
         """Give back the solution from which it starts."""
         photos = solved_photos(msgspec.convert(given.facts["dataset.light"], dict[str, LightSlice]))
         solves.append((photos, given.folders.get("surface"), decided))
+        progress(0, 1)
         shutil.copytree(given["start"], out, dirs_exist_ok=True)
 
     monkeypatch.setattr(stages.solve, "main", solve)
@@ -105,7 +106,7 @@ def test_a_photo_that_rejoins_is_solved_with_the_others_from_their_answer_withou
         (tmp_path / "plain").mkdir()
         write_json(tmp_path / "plain" / "texture.json", TextureTable())
         inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": tmp_path / "plain"})
-    out = ran(exchange, inputs, tmp_path / "out", silent)
+    out = ran(exchange, inputs, tmp_path / "out", Rising())
     assert not read_result(out / EXCHANGE_FILE, Exchange, "exchange").kept
     assert solves[-1] == (list(TURNS), None, True) and len(solves) == 1 + textured
     after = with_exchange(msgspec.structs.replace(inputs, folders=inputs.folders | {"exchange": out}))

@@ -29,7 +29,8 @@ RADIANCE = np.random.default_rng(1).uniform(0, 0.8, (H, W, 3)).astype(np.float32
 CHANNELS = {"R", "G", "B", "label", "valid", "left_out", "object", "clipped.R", "clipped.G", "clipped.B"}
 SMALLER = {"pixels": 100}  # of the 152 that show a material: factor 2
 OWN = [ObjectMask("a", None), ObjectMask("b", "own.png")]
-GIVEN = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "kitchen"}
+GIVEN = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "labels": MATERIALS, "focal_px": None}
+GIVEN["illumination"] = "kitchen"
 
 
 @pytest.fixture
@@ -49,6 +50,18 @@ def run(folder, params=None, **facts):
     out = ran(masks, inputs, folder / "out", **params or {})
     assert sorted(path.name for path in out.iterdir()) == ["kitchen.exr", "kitchen.json"]
     return read_exr(out / "kitchen.exr"), json.loads((out / "kitchen.json").read_text())
+
+
+def test_the_alpha_of_a_cut_out_is_averaged_down_with_it_and_an_opaque_photo_has_none(folder):
+    codes = np.dstack([np.full((H, W, 3), 120, np.uint8), np.where(LABEL > 0, 255, 40).astype(np.uint8)])
+    Image.fromarray(codes).save(folder / "in" / "photo.png")
+    channels, facts = run(folder, SMALLER, image="photo.png")
+    f = facts["factor"]
+    boxes = codes[: H // f * f, : W // f * f, 3].reshape(H // f, f, W // f, f)
+    np.testing.assert_allclose(channels.pop("alpha"), boxes.mean((1, 3)) / 255, atol=1e-6)
+    assert f == 2 and set(channels) == CHANNELS
+    Image.fromarray(codes | np.array([0, 0, 0, 255], np.uint8)).save(folder / "in" / "photo.png")
+    assert set(run(folder, image="photo.png")[0]) == CHANNELS
 
 
 def refused(folder, **facts):

@@ -1,20 +1,22 @@
 """The stage `recipes`: the files of every kind, what they show, the same bytes again, and what it refuses."""
 
 import json
+import shutil
 
 import msgspec
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
+from factorlib.images.exr import read_exr, read_rgb_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.meshes.read_mesh import read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.recipe import kinds
-from factorlib.render.insertion import ShadowMatch
+from factorlib.render.insertion import LUMINANCE, ShadowMatch
 from factorlib.render.photo_scene import UP, LightMap, rotate_light, traced_photo
 from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
@@ -126,6 +128,77 @@ def test_the_photo_stays_where_no_object_is(inputs, tmp_path):
     result, empty = read_png(tmp_path / "out" / "front.png"), read_exr(inputs["align"] / "front.exr")["label"] == 0
     far = ~np.any([np.roll(~empty, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
     assert np.array_equal(result[far], photo[far]) and not np.array_equal(result[~empty], photo[~empty])
+
+
+@pytest.mark.parametrize("recipe", [
+    kinds.ResynthesisRecipe(**FRONT), kinds.InsertRecipe(photos=["front"], samples=16, size=0.3, at=(14.0, 52.0)),
+], ids=["resynthesis", "insert"])  # fmt: skip
+def test_a_cut_out_stays_one_and_laid_over_a_backdrop_is_the_picture_over_that_backdrop(
+    grounded, tmp_path, monkeypatch, caplog, recipe
+):
+    monkeypatch.setattr("factorlib.render.recipe_pictures.add_grain", lambda radiance, *_: radiance)
+    channels = read_exr(grounded["masks"] / "front.exr")
+    alpha = gaussian_filter((channels["label"] > 0).astype(float), 1.0)
+    backdrop = 0.3  # grey: alpha holds the luminance of a shadow and not its colour
+    pictures = []
+    for name, laid in (("cut", False), ("whole", True)):
+        photo = np.stack([channels[c] for c in "RGB"], axis=-1)
+        photo = alpha[..., None] * photo + (1 - alpha[..., None]) * backdrop if laid else photo
+        shutil.copytree(grounded["masks"], tmp_path / name)
+        written = {**channels, **dict(zip("RGB", np.moveaxis(photo, -1, 0))), **({} if laid else {"alpha": alpha})}
+        write_exr(tmp_path / name / "front.exr", {c: np.ascontiguousarray(v, np.float32) for c, v in written.items()})
+        inputs = msgspec.structs.replace(grounded, folders={**grounded.folders, "masks": tmp_path / name})
+        ground = {"ground": {**GROUND["ground"], "diffuse": [0.3, 0.3, 0.3]}}
+        drawn(
+            changed(inputs, "dataset.ground", dict.fromkeys(made_export.MESHES, ground)),
+            tmp_path / f"{name} out",
+            recipe,
+        )
+        pictures.append(read_exr(tmp_path / f"{name} out" / "front.exr"))
+    cut, whole = (np.stack([each[c] for c in "RGB"], axis=-1) for each in pictures)
+    opacity = pictures[0]["A"][..., None]
+    assert "A" not in pictures[1] and opacity.min() == 0 and opacity.max() == pytest.approx(1)
+    apart = np.abs((cut + (1 - opacity) * backdrop - whole) @ LUMINANCE)
+    assert np.quantile(apart, 0.99) < 0.005  # light that the new object sends to the ground is no alpha
+    assert ("shows no ground" in caplog.text) == isinstance(recipe, kinds.InsertRecipe)
+    if isinstance(recipe, kinds.InsertRecipe):
+        assert "shows no ground" in json.loads((tmp_path / "cut out" / "front.json").read_text())["caption"]
+        assert ((opacity[..., 0] > 0.05) & (cut.max(-1) < 1e-6)).any()  # the shadow
+
+
+@pytest.mark.parametrize("camera", [
+    {"azimuth": 50.0, "elevation": 20.0}, {"azimuth": 50.0, "floor": 0.5},
+])  # fmt: skip
+def test_a_relit_picture_from_another_view_is_that_view_in_another_light(inputs, tmp_path, camera):
+    """In the photo's own light, which a map stands for, it has the same pixels up to its exposure."""
+    common = {"photos": ["front"], "samples": 64, "width": 32, **camera}
+    write_rgb_exr(tmp_path / "own.exr", lat_long_of_lobes(SolvedSet(inputs).light("front"), 128, 256))
+    drawn(inputs, tmp_path / "view", kinds.recipe_of({"kind": "view", **common}))
+    relit = kinds.recipe_of({"kind": "relight", "lights": ["own.exr"], **common})
+    drawn(inputs, tmp_path / "relit", relit, **{"own.exr": tmp_path / "own.exr"})
+    view, again = (read_exr(path) for path in (tmp_path / "view/front.exr", tmp_path / "relit/front/own.exr"))
+    np.testing.assert_allclose(view["A"], again["A"], atol=1e-3)
+    sums = [np.array([each[c].sum() for c in "RGB"]) for each in (view, again)]
+    np.testing.assert_allclose(sums[0] / sums[0].sum(), sums[1] / sums[1].sum(), rtol=0.05)
+    correlation = np.corrcoef(view["G"].ravel(), again["G"].ravel())[0, 1]
+    assert correlation > 0.98
+
+
+def test_a_floor_in_a_hard_sun_is_the_grey_that_it_is_and_not_white(inputs, tmp_path):
+    lat_long = np.full((32, 64, 3), 0.02)
+    lat_long[6:8, 10:12] = 300.0
+    write_rgb_exr(tmp_path / "sun.exr", lat_long)
+    recipe = kinds.RelightRecipe(photos=["front"], lights=["sun.exr"], samples=16, floor=0.5, width=48)
+    drawn(
+        changed(inputs, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND)),
+        tmp_path / "out",
+        recipe,
+        **{"sun.exr": tmp_path / "sun.exr"},
+    )
+    picture = read_exr(tmp_path / "out/front/sun.exr")
+    full = picture["A"] > 0.99
+    brightest = np.max([picture[c] for c in "RGB"], axis=0)[full]
+    assert np.quantile(brightest, 0.9) < 0.6 and np.quantile(brightest, 0.99) > 0.3
 
 
 def own_material(inputs, tmp_path, material):
