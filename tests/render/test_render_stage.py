@@ -29,8 +29,6 @@ from tests.integral import reflected
 from tests.runner.toy import files_of
 from tests.stages.made import ran
 
-FAST = render.Params(operator="closed_form", ball_size=33)
-
 
 @pytest.fixture
 def inputs():
@@ -41,7 +39,7 @@ def run(inputs, photo, out):
     of_photo = made_export.of_photo(inputs, photo)
     shaded = ran(shading, of_photo, out.with_name(f"{out.name}, shading"), silent, operator="closed_form")
     after = msgspec.structs.replace(of_photo, folders={**of_photo.folders, "shading": shaded})
-    return ran(render, after, out, silent, operator="closed_form", ball_size=33, map_size=32)
+    return ran(render, after, out, silent, operator="closed_form", ball_size=33)
 
 
 def test_pictures_are_all_there_and_the_same_bytes_again(inputs, tmp_path):

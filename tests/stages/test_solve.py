@@ -115,7 +115,16 @@ def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_p
     out = run(tmp_path, linked, splittings=1)
     model = table(out)["model"]
     splitting, *again = model["splitting_chosen_by"]
-    measures = {"held_out_loss_with", "held_out_loss_without", "margin", "log_bayes_factor", "correlation", "width"}
+    measures = {
+        "held_out_loss_with",
+        "held_out_loss_without",
+        "margin",
+        "log_bayes_factor",
+        "correlation",
+        "width",
+        "share",
+        "warmth",
+    }
     assert set(splitting) == {"kept", *measures}
     counts = [model["lobes"][name] - model["suns_chosen_by"][name]["kept"] for name in "ab"]
     assert model["light_prior"] and any(each["kept"] for each in (splitting, *again)) == (max(counts) > 24)
