@@ -1,6 +1,6 @@
-"""Errors of normals by their confidence, where true ones are known: `python -m studies.measured.normals DATASET …`.
+"""Errors of normals by their confidence, and of poses, where true ones are known.
 
-The table shows how well `factorlib.inference.normal_errors` states them.
+`python -m studies.measured.normals DATASET …` shows how well `factorlib.inference.normal_errors` states them.
 """
 
 import sys
@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.dataset.read_dataset import read_dataset
+from factorlib.evaluate.truth import pose_error
 from factorlib.images.exr import read_exr
 from factorlib.inference.normal_errors import DEVIATION
+from factorlib.results.poses import FILE, read_poses
 from factorlib.urm.extract import read_geometry
 from studies.measured.tools import ROOT, machine, markdown_table, run_verb
 
@@ -37,9 +39,18 @@ def errors_of(dataset: Path) -> Float[np.ndarray, "n 2"]:
     return np.vstack(rows)
 
 
+def turns_of(dataset: Path) -> list[float]:
+    """Return the error of the rotation of every estimated pose whose true one is known, in degrees."""
+    truth = read_dataset(dataset).truth
+    poses = read_poses(ROOT / "build" / dataset.name / "align" / FILE)
+    pairs = ((poses[photo].objects, true) for photo, true in (truth.poses if truth else {}).items())
+    return [pose_error(entries[name], true[name]).rotation_deg for entries, true in pairs for name in true]
+
+
 def main() -> None:
     """Print the table of the data sets that are named."""
-    errors = np.vstack([errors_of(Path(word).resolve()) for word in sys.argv[1:]])
+    datasets = [Path(word).resolve() for word in sys.argv[1:]]
+    errors = np.vstack([errors_of(dataset) for dataset in datasets])
     errors = errors[errors[:, 1] < LARGEST]
     rows = []
     for low, high in zip(EDGES, EDGES[1:]):
@@ -52,6 +63,9 @@ def main() -> None:
             [f"{low} to {high}", f"{len(angle):,}", *(f"{v:.1f}" for v in (measured, np.median(angle), stated))]
         )
     print(machine())
+    for dataset in datasets:
+        turn = np.sqrt(np.mean(np.square(turns_of(dataset))) / 3)
+        print(f"{dataset.name}: poses are turned by {turn:.2f}° about an axis (RMS)")
     print(markdown_table(["confidence", "pixels", "RMS along a tangent, °", "median, °", "stated, °"], rows))
 
 
