@@ -50,8 +50,8 @@ from factorlib.render.photo_scene import (
 )
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
+from factorlib.results.exchange import with_exchange
 from factorlib.results.materials import SolvedMaterial
-from factorlib.results.texture_table import with_exchange
 from factorlib.stage import Inputs, silent
 from factorlib.wholefile import write_bytes
 from factorlib.yamlfile import convert

@@ -25,7 +25,9 @@ from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import CREASE_DEG, read_mesh
 from factorlib.meshes.triangle_soup import Limits
-from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, pose_fields, read_photo_facts, read_shapes
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, pose_fields
+from factorlib.results.shape_table import read_shapes
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")

@@ -38,11 +38,13 @@ from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import is_hard, lobe_energy
 from factorlib.render.resynthesis import paint_shading
+from factorlib.results.exchange import with_exchange
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
 from factorlib.results.metrics import AlbedoErrors, Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
-from factorlib.results.poses import read_photos, read_poses
-from factorlib.results.texture_table import read_surface, with_exchange
+from factorlib.results.photos import read_photos
+from factorlib.results.poses import read_poses
+from factorlib.results.surface_table import read_surface
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels, read_geometry
 from factorlib.wholefile import write_text

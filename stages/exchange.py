@@ -10,7 +10,7 @@ with its choices of the model.  Textures and surface detail stay those of the ot
 If no texture is kept, or the exchange is not, the solve continues without paint.
 
 Writes exchange.json.  If the solve continued, the folders `solve`, `shading` and, with paint, `texture` are new results
-of these stages, which replace theirs (`factorlib.results.texture_table`).
+of these stages, which replace theirs (`factorlib.results.exchange`).
 """
 
 import logging
@@ -30,15 +30,10 @@ import stages.texture
 from factorlib.dataset.schema import LightSlice, with_all_rejoined
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
-from factorlib.results.texture_table import (
-    BEGINNING,
-    EXCHANGE_FILE,
-    REPLACED,
-    SURFACE_FILE,
-    Exchange,
-    TextureTable,
-    read_table,
-)
+from factorlib.results.exchange import FILE, REPLACED, Exchange
+from factorlib.results.surface_table import BEGINNING
+from factorlib.results.surface_table import FILE as SURFACE
+from factorlib.results.texture_table import TextureTable, read_table
 from factorlib.stage import Inputs, Progress, silent
 from factorlib.urm.extract import read_geometry
 
@@ -64,7 +59,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     decision = Exchange(False)
     if params.solve.solver == "paper":  # its materials are uniform, and it continues no solution
-        write_json(out / EXCHANGE_FILE, decision)
+        write_json(out / FILE, decision)
         return
     rejoining = any(light.rejoins for light in lights.values())
     half = 0.5 if before.longest and rejoining else 0  # of the work, where it may take two solves
@@ -80,7 +75,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
                 shutil.rmtree(out / name)
     if not decision.kept and rejoining:
         solve_again(params, inputs, out, part_of(progress, half, 1))
-    write_json(out / EXCHANGE_FILE, decision)
+    write_json(out / FILE, decision)
 
 
 @contextmanager
@@ -138,7 +133,7 @@ def paint_surface(inputs: Inputs, folder: Path, photos: list[str]) -> Path:
     """Write a result of `surface` into a folder, with the textures as its detail; return the folder."""
     surface = inputs.folders.get("surface")
     (folder / "photos").mkdir()
-    for file in (SURFACE_FILE, BEGINNING):
+    for file in (SURFACE, BEGINNING):
         if surface is not None and (surface / file).is_file():
             shutil.copy(surface / file, folder / file)
     for name in photos:

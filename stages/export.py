@@ -43,10 +43,11 @@ from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG
+from factorlib.results.exchange import with_exchange
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
-from factorlib.results.texture_table import read_table, with_exchange
+from factorlib.results.texture_table import read_table
 from factorlib.stage import Inputs, Progress
 from factorlib.tracing.scene import mitsuba_map
 from factorlib.wholefile import write_bytes, write_text

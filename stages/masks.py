@@ -13,7 +13,7 @@ import numpy as np
 from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.camera_files import is_raw
-from factorlib.images.exif import reported_processing
+from factorlib.images.colours import count_colours
 from factorlib.images.exr import write_exr
 from factorlib.images.lens import Undistortion, radial_lens
 from factorlib.images.photo import (
@@ -27,10 +27,11 @@ from factorlib.images.photo import (
     open_photo,
     read_alpha,
 )
+from factorlib.images.processing import reported_processing
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
-from factorlib.labels.label_image import Labels, count_colours, read_labels, read_object_indices
-from factorlib.results.poses import PhotoFacts
+from factorlib.labels.label_image import Labels, read_labels, read_object_indices
+from factorlib.results.photos import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 
 log = logging.getLogger("factorlib.masks")

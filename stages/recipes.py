@@ -9,7 +9,7 @@ from factorlib.meshes.read_mesh import CREASE_DEG
 from factorlib.recipe.kinds import recipe_of
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
-from factorlib.results.texture_table import with_exchange
+from factorlib.results.exchange import with_exchange
 from factorlib.stage import Inputs, Progress
 
 

@@ -16,9 +16,9 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.reflection import reflection_operator
 from factorlib.render.resynthesis import Reflector, paint_shading, render_ball
+from factorlib.results.exchange import with_exchange
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import read_materials, select_materials
-from factorlib.results.texture_table import with_exchange
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import read_geometry
 

@@ -16,7 +16,7 @@ from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
 from factorlib.report.pictures import exposures, first_pictures, material_tags, photo_row, strip, surface_rows
 from factorlib.report.viewer import viewer_data
-from factorlib.results.texture_table import with_exchange
+from factorlib.results.exchange import with_exchange
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
 

@@ -21,7 +21,9 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.images.exr import read_exr
 from factorlib.images.tone import srgb_encode
 from factorlib.jsonfile import write_json
-from factorlib.results.poses import SHAPES_FILE, ShapeEntry, ShapesTable, pose_fields, read_photo_facts
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import pose_fields
+from factorlib.results.shape_table import FILE, ShapeEntry, ShapesTable
 from factorlib.shapes.gaps import mend_gaps
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
@@ -74,7 +76,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
                 shape_kind(entry),
                 100 * shape.overlap,
             )
-    write_json(out / SHAPES_FILE, ShapesTable(cameras, shapes))
+    write_json(out / FILE, ShapesTable(cameras, shapes))
     progress(1, 1)
 
 

@@ -51,9 +51,10 @@ from factorlib.light.lobes import Lobes
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Name
-from factorlib.results.lobe_table import EarlierSolution, read_earlier_solution, write_lobes
+from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Channels, Model, vec3
-from factorlib.results.texture_table import BEGINNING
+from factorlib.results.solution import EarlierSolution, read_earlier_solution
+from factorlib.results.surface_table import BEGINNING
 from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
 

@@ -33,7 +33,7 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
-from factorlib.results.texture_table import BEGINNING, SURFACE_FILE, DetailEvidence, SurfaceTable
+from factorlib.results.surface_table import BEGINNING, FILE, DetailEvidence, SurfaceTable
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import (
     Observations,
@@ -58,14 +58,14 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Estimate the surface detail of all meshes, and write it if it is kept."""
     if params.shape == "off":
-        write_json(out / SURFACE_FILE, SurfaceTable())
+        write_json(out / FILE, SurfaceTable())
         return
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     photos = read_aligned_photos(inputs, slices)
     read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     surfaces = Surfaces({name: subdivided_mesh(mesh) for name, mesh in visible_meshes(read, slices).items()})
     if not surfaces.meshes:
-        write_json(out / SURFACE_FILE, SurfaceTable())
+        write_json(out / FILE, SurfaceTable())
         return
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     fitted = sorted(solved_photos(lights))
@@ -98,7 +98,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         bool(displacements), DetailEvidence.from_decision(result.evidence, result.stiffness.turn),
         bool(factors), DetailEvidence.from_decision(result.painted, result.stiffness.factor), result.gains, *by_mesh,
     )  # fmt: skip
-    write_json(out / SURFACE_FILE, table)
+    write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
     progress(1, 1)
 

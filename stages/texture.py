@@ -28,15 +28,8 @@ from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import SubdividedMesh, subdivided_mesh
 from factorlib.render.resynthesis import read_shading
 from factorlib.results.materials import MaterialTable, read_materials
-from factorlib.results.texture_table import (
-    FACTORS,
-    FILE,
-    DetailEvidence,
-    TextureEvidence,
-    TextureTable,
-    read_surface,
-    write_factors,
-)
+from factorlib.results.surface_table import DetailEvidence, read_surface
+from factorlib.results.texture_table import FACTORS, FILE, TextureEvidence, TextureTable, write_factors
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import Channels, observed_pixels, read_geometry
 

@@ -20,10 +20,12 @@ from factorlib.geometry.occlusion import Occluders
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache
-from factorlib.results.poses import ObjectPose, read_photo_facts, read_photo_poses
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
+from factorlib.urm.background import surrounding_radiance
 from factorlib.urm.cast_shadows import GroundView, ground_observations
-from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre, surrounding_radiance
+from factorlib.urm.extract import PhotoSource, extract_observations, surface_centre
 from factorlib.urm.observations import write_observations
 from factorlib.urm.reduction import merge, sample
 

@@ -15,7 +15,7 @@ from factorlib.dataset.schema import ExternalCamera, ObjectsSlice, Vec2
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
-from factorlib.results.poses import PhotoFacts
+from factorlib.results.photos import PhotoFacts
 
 FIELD_DEG = 1.0, 150.0  # range of cameras' fields of view across the longer side, degrees
 MOST_ROUNDED_PX = 1.0  # greatest rounding of a resized picture's side, which is a whole number

@@ -16,7 +16,8 @@ from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read_mesh import MeshCache
 from factorlib.results.materials import PaintRange, Reflectance
 from factorlib.results.poses import ObjectPose
-from factorlib.results.texture_table import read_surface, read_textures
+from factorlib.results.surface_table import read_surface
+from factorlib.results.texture_table import read_textures
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import paint, rigid
 

@@ -140,28 +140,3 @@ def _positive(exif: Mapping[str, Any], name: str) -> float | None:
     """Return a tag as a number, None if it is missing or not positive."""
     value = exif.get(name)
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None
-
-
-RENDERED = {
-    1: "by a process of its own",
-    **dict.fromkeys((2, 3, 4), "HDR"),
-    6: "panorama",
-    7: "portrait, HDR",
-    8: "portrait",
-}
-HARD = 2  # value of EXIF's Sharpness
-
-
-def reported_processing(exif: Mapping[str, Any]) -> str | None:
-    """Return EXIF's description of irreversible processing (CustomRendered, also with Apple's values, and Sharpness).
-
-    It is None if there is none.
-
-    >>> reported_processing({"Exif:CustomRendered": 3}), reported_processing({"Exif:Sharpness": 0})
-    ('HDR', None)
-    """
-    kinds = [
-        RENDERED.get(exif.get("Exif:CustomRendered", 0)),
-        "sharpened" if exif.get("Exif:Sharpness") == HARD else None,
-    ]
-    return ", ".join(filter(None, kinds)) or None

@@ -25,8 +25,8 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.uncertainty import ABSOLUTE, GAUGE, MaterialErrors
 from factorlib.light.lobes import Lobes
 from factorlib.results import materials as table
-from factorlib.results.lobe_table import EarlierSolution
 from factorlib.results.materials import Decision, Uncertainty
+from factorlib.results.solution import EarlierSolution
 
 LOBES_CHOSEN_BY = {
     "joint": "cells of the light prior, of which the brightest split while the marginal likelihood rises",

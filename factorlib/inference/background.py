@@ -1,6 +1,6 @@
 """Prior on a light, given the surroundings that its photos show.
 
-`factorlib.urm.extract` says which radiance L arrives from the directions that a photo shows.  A cell is observed as
+`factorlib.urm.background` says which radiance L arrives from the directions that a photo shows.  A cell is observed as
 
     b = log Σ_j w_j L_j / Σ_j w_j,     w_j = exp(λ(z · ω_j − 1)) Ω_j,     coverage c = Σ_j w_j / ∫ exp(λ(z · ω − 1)) dω,
 
@@ -63,7 +63,7 @@ class Background(msgspec.Struct, frozen=True):
         """Return the texels of a map that are not 0.
 
         Args:
-            lat_long: Map of `factorlib.urm.extract`, in the camera's y-up frame.
+            lat_long: Map of `factorlib.urm.background`, in the camera's y-up frame.
             rotation: Rotation from the camera's frame (OpenCV) to the light's.
             unit: Unit of the block.
         """

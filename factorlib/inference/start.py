@@ -36,7 +36,7 @@ from factorlib.inference.lights import DARKEST, TONE_RANGE, Light, UnitLobes, fi
 from factorlib.inference.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.results.lobe_table import EarlierSolution
+from factorlib.results.solution import EarlierSolution
 
 log = logging.getLogger("factorlib.inference")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start

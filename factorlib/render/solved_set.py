@@ -25,7 +25,8 @@ from factorlib.render.photo_scene import DistantLight, LightMap, PhotoScene, Pla
 from factorlib.results.lobe_table import read_photo_light
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.texture_table import read_surface, read_textures
+from factorlib.results.surface_table import read_surface
+from factorlib.results.texture_table import read_textures
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import rigid
 

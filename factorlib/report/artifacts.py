@@ -12,18 +12,14 @@ from jaxtyping import Float
 
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.reading import check_plain
+from factorlib.results.exchange import Exchange, read_exchange
 from factorlib.results.materials import Channels as Factors
 from factorlib.results.materials import MaterialTable, read_exposures, read_materials
 from factorlib.results.metrics import Metrics, read_metrics
-from factorlib.results.poses import PhotoFacts, PhotoPoses, read_photos, read_poses
-from factorlib.results.texture_table import (
-    Exchange,
-    SurfaceTable,
-    TextureTable,
-    read_exchange,
-    read_surface,
-    read_table,
-)
+from factorlib.results.photos import PhotoFacts, read_photos
+from factorlib.results.poses import PhotoPoses, read_poses
+from factorlib.results.surface_table import SurfaceTable, read_surface
+from factorlib.results.texture_table import TextureTable, read_table
 
 STAGES = [
     "masks",

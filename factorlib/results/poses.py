@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from factorlib.dataset.schema import ExternalCamera
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose, is_pose
 from factorlib.jsonfile import read_result
@@ -128,84 +127,3 @@ def _check(photo: PhotoPoses, path: str | Path, key: str) -> None:
                     key=f"{key}.{name}",
                     cure="run the stage `align` again",
                 )
-
-
-# photos.json of `masks`: facts about each photo.
-#
-# `masks` writes the entry of one photo as <photo>.json; photos.json collects them.
-
-Size = Annotated[int, msgspec.Meta(ge=1)]
-
-
-class PhotoFacts(msgspec.Struct, frozen=True):
-    """Facts about one photo, in pixels of <photo>.exr of `masks`, each of which covers factor² of the photo's.
-
-    Attributes:
-        original_size: width and height of the photo itself, as displayed
-        focal_px: None if it is unknown
-        focal_source: dataset or exif
-        exposure: t·S/N² from EXIF, None if it is unknown
-        pixels: number of valid pixels by material
-        clipped_fraction: share of them clipped in any channel
-    """
-
-    width: Size
-    height: Size
-    factor: Size
-    original_size: tuple[Size, Size]
-    focal_px: Positive | None = None
-    focal_source: str | None = None
-    encoding: str = "srgb"
-    exposure: float | None = None
-    illumination: str = ""
-    pixels: dict[str, int] = {}
-    clipped_fraction: float = 0.0
-
-
-def read_photo_facts(path: str | Path) -> PhotoFacts:
-    """Read the facts of one photo as `masks` writes them; InputError if the file has another form."""
-    return read_result(path, PhotoFacts, "masks")
-
-
-def read_photos(path: str | Path) -> dict[str, PhotoFacts]:
-    """Read photos.json: facts by photo; InputError if the file has another form."""
-    return read_result(path, dict[str, PhotoFacts], "masks")
-
-
-# shapes.json: cameras from structure from motion, and shapes reconstructed from masks.
-
-SHAPES_FILE = "shapes.json"
-
-
-class ShapeEntry(msgspec.Struct, frozen=True):
-    """A reconstructed shape.
-
-    Attributes:
-        kind: hull, lathe, ball, box or cylinder
-        extent: size of its bounding box, in its own units
-        photos: photos whose outlines were used
-        overlap: mean IoU of the shape with these outlines
-    """
-
-    kind: str
-    extent: tuple[float, float, float]
-    triangles: int
-    photos: list[str]
-    overlap: float
-
-
-class ShapesTable(msgspec.Struct, frozen=True):
-    """Content of shapes.json.
-
-    Attributes:
-        cameras: cameras that structure from motion placed, by photo
-        meshes: shapes by name
-    """
-
-    cameras: dict[str, ExternalCamera] = {}
-    meshes: dict[str, ShapeEntry] = {}
-
-
-def read_shapes(folder: Path | None) -> ShapesTable:
-    """Read the table in the folder of the stage `shapes`; it is empty without a folder."""
-    return ShapesTable() if folder is None else read_result(folder / SHAPES_FILE, ShapesTable, "shapes")

@@ -28,7 +28,8 @@ from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import read_result
 from factorlib.meshes.read_mesh import read_mesh
-from factorlib.results.poses import PhotoPoses, read_photo_facts, read_photo_poses
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import PhotoPoses, read_photo_poses
 from factorlib.scenes.stage_runs import run_stages
 from stages import align, masks
 from studies.measured.align import normal_error_deg, share

@@ -23,8 +23,8 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError
-from factorlib.generate.eames import print_pattern
 from factorlib.generate.folder import label_pixels, write_light, write_yaml
+from factorlib.generate.paint import print_pattern
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import unit
 from factorlib.images.exr import encode_pixels, read_rgb_exr

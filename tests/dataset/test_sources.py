@@ -17,7 +17,7 @@ from factorlib.dataset.schema import ExternalCamera, ObjectsSlice
 from factorlib.dataset.slices import dataset_slice
 from factorlib.dataset.sources.external_cameras import upright_turn
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.results.poses import PhotoFacts
+from factorlib.results.photos import PhotoFacts
 from tests.faults.sample import put
 from tests.refusal import refusal
 

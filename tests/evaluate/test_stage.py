@@ -16,7 +16,7 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import read_json
 from factorlib.results.materials import Misfit, Reflectance, StandardErrors, attach_errors
 from factorlib.results.metrics import Metrics, Verdict
-from factorlib.results.texture_table import DetailEvidence, SurfaceTable
+from factorlib.results.surface_table import DetailEvidence, SurfaceTable
 from factorlib.runner.verbs import NO_TRUST
 from stages import evaluate
 from tests.evaluate.made_artifacts import TRUE, Made, light_map, make_artifacts, paint

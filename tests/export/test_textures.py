@@ -10,10 +10,11 @@ from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from factorlib.export import texture_atlas
+from factorlib.export import simplification
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import headroom_factor, paint_range
-from factorlib.export.texture_atlas import MOST_ERROR, Surface, make_atlas, simplify
+from factorlib.export.simplification import MOST_ERROR, Surface, simplify
+from factorlib.export.texture_atlas import make_atlas
 from factorlib.images.tone import srgb_decode
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh, smooth
@@ -108,8 +109,8 @@ def test_simplified_surfaces_are_near_and_keep_borders_of_materials_and_creases(
     x, y, z = ball.triangles_center.T
     label = np.where(z > 0.2 * np.sin(5 * np.arctan2(y, x)), 2, 1)
     mesh = smooth(np.asarray(ball.vertices), ball.faces, label)
-    assert simplify(mesh).faces is mesh.faces or len(mesh.faces) > texture_atlas.MOST_TRIANGLES
-    monkeypatch.setattr(texture_atlas, "MOST_TRIANGLES", 9000)
+    assert simplify(mesh).faces is mesh.faces or len(mesh.faces) > simplification.MOST_TRIANGLES
+    monkeypatch.setattr(simplification, "MOST_TRIANGLES", 9000)
     result = simplify(mesh)
     assert len(result.faces) <= 9000
     for a, b in ((mesh, result), (result, mesh)):

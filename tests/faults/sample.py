@@ -28,8 +28,9 @@ from factorlib.jsonfile import read_json
 from factorlib.labels.label_image import read_labels
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.read_mesh import read_mesh
-from factorlib.results.lobe_table import read_earlier_solution, read_lobes, write_lobes
+from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.poses import read_poses
+from factorlib.results.solution import read_earlier_solution
 from factorlib.stage import Inputs
 from factorlib.urm.observations import Observations, read_observations, write_observations
 from factorlib.validation import Validation

@@ -11,7 +11,7 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.generate import eames, folder, surroundings, synthetic
 from factorlib.generate.chair import chair, label_parts
-from factorlib.generate.eames import choose_patterns, paint_mesh
+from factorlib.generate.paint import choose_patterns, paint_mesh
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr

@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorlib.dataset.schema import Intrinsics
+from factorlib.images.colours import count_colours
+from factorlib.images.grain import add_grain, grain_covariance
 from factorlib.images.lens import Undistortion, radial_lens
 from factorlib.images.photo import Photo, box_mean
 from factorlib.images.picture import read_png, write_png
 from factorlib.images.tone import by_log_exponent, curve, inverse, power_decode, slope, srgb_decode, srgb_encode
-from factorlib.labels.label_image import count_colours
-from factorlib.render.recipe_pictures import add_grain, grain_covariance
 from tests.refusal import refusal
 
 X = np.concatenate([[0.0, 1e-4], np.geomspace(0.01, 50, 40)])

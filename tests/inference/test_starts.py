@@ -22,8 +22,8 @@ from factorlib.inference.start import (
     start_from_surface,
     with_earlier_decisions,
 )
-from factorlib.results.lobe_table import EarlierSolution
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
+from factorlib.results.solution import EarlierSolution
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block
 from factorlib.stage import serial_map
 from tests.inference.made_lights import FEW, OPERATOR, drawn, natural, on_even_cells, spheres

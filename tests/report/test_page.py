@@ -15,8 +15,9 @@ from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
 from factorlib.report.artifacts import STAGES
-from factorlib.report.page import sentences
 from factorlib.report.pictures import downsample
+from factorlib.report.template import sentences
+from factorlib.results.exchange import Exchange
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import (
     Decision,
@@ -24,7 +25,8 @@ from factorlib.results.materials import (
     Model,
     read_materials,
 )
-from factorlib.results.texture_table import DetailEvidence, Exchange, TextureEvidence, TextureTable
+from factorlib.results.surface_table import DetailEvidence
+from factorlib.results.texture_table import TextureEvidence, TextureTable
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs
 from stages import evaluate, report

@@ -18,15 +18,8 @@ from factorlib.results.materials import (
     select_materials,
 )
 from factorlib.results.metrics import Counts, Metrics, ResynthesisErrors, read_metrics
-from factorlib.results.poses import (
-    CameraEntry,
-    ObjectPose,
-    PhotoFacts,
-    PhotoPoses,
-    read_photo_facts,
-    read_photo_poses,
-    read_poses,
-)
+from factorlib.results.photos import PhotoFacts, read_photo_facts
+from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, read_photo_poses, read_poses
 from tests.refusal import refusal
 
 ERRORS = StandardErrors((0.01, 0.02, 0.03), (0.1, 0.1, 0.1), 0.05)

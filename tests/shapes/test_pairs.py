@@ -4,8 +4,8 @@ from itertools import combinations
 
 import numpy as np
 
-from factorlib.shapes import motion
-from factorlib.shapes.motion import ADJACENT, NEIGHBOURS, RATIO, count_matches, overlapping_pairs
+from factorlib.shapes import pairs
+from factorlib.shapes.pairs import ADJACENT, NEIGHBOURS, RATIO, count_matches, overlapping_pairs
 
 RNG = np.random.default_rng(0)
 
@@ -50,7 +50,7 @@ def test_where_all_photos_overlap_each_has_those_it_shares_most_with():
 
 
 def test_a_photo_of_another_thing_is_paired_with_its_neighbours_in_order_alone(monkeypatch):
-    monkeypatch.setattr(motion, "ADJACENT", 1)
+    monkeypatch.setattr(pairs, "ADJACENT", 1)
     descriptors, _ = walk(12, 20, np.arange(12))
     descriptors[5], descriptors[8] = descriptors_of(world(40)), descriptors_of(world(1)[:0])
     result = overlapping_pairs(descriptors)

@@ -12,8 +12,9 @@ from factorlib.dataset.schema import LightSlice, solved_photos
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_result, write_json
 from factorlib.light.lobes import Lobes
+from factorlib.results.exchange import FILE, REPLACED, Exchange, with_exchange
 from factorlib.results.lobe_table import read_lobes, write_lobes
-from factorlib.results.texture_table import EXCHANGE_FILE, REPLACED, Exchange, TextureTable, read_table, with_exchange
+from factorlib.results.texture_table import TextureTable, read_table
 from factorlib.stage import Inputs
 from stages import exchange, shading
 from tests.stages.made import Rising, ran
@@ -65,7 +66,7 @@ def exchanged(monkeypatch, tmp_path, inputs: Inputs, solution) -> Inputs:
 def test_lights_that_explain_the_paint_better_replace_all_three_results(monkeypatch, tmp_path, painted, caplog):
     inputs, true = painted
     after = exchanged(monkeypatch, tmp_path, inputs, true)
-    decision = read_result(tmp_path / EXCHANGE_FILE, Exchange, "exchange")
+    decision = read_result(tmp_path / FILE, Exchange, "exchange")
     assert decision.kept and decision.loss_after < decision.loss_before
     assert {name: after[name] for name in REPLACED} == {name: tmp_path / name for name in REPLACED}
     assert (after["solve"] / "lobes.parquet").read_bytes() == (true / "lobes.parquet").read_bytes()
@@ -77,8 +78,8 @@ def test_lights_that_explain_the_paint_better_replace_all_three_results(monkeypa
 def test_where_nothing_is_predicted_better_all_stays(monkeypatch, tmp_path, painted, caplog):
     inputs, _ = painted
     after = exchanged(monkeypatch, tmp_path, inputs, inputs["solve"])
-    assert not read_result(tmp_path / EXCHANGE_FILE, Exchange, "exchange").kept
-    assert [path.name for path in tmp_path.iterdir()] == [EXCHANGE_FILE]
+    assert not read_result(tmp_path / FILE, Exchange, "exchange").kept
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
     assert after.folders == inputs.folders | {"exchange": tmp_path}
     assert not caplog.messages
 
@@ -107,7 +108,7 @@ def test_a_photo_that_rejoins_is_solved_with_the_others_from_their_answer_withou
         write_json(tmp_path / "plain" / "texture.json", TextureTable())
         inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": tmp_path / "plain"})
     out = ran(exchange, inputs, tmp_path / "out", Rising())
-    assert not read_result(out / EXCHANGE_FILE, Exchange, "exchange").kept
+    assert not read_result(out / FILE, Exchange, "exchange").kept
     assert solves[-1] == (list(TURNS), None, True) and len(solves) == 1 + textured
     after = with_exchange(msgspec.structs.replace(inputs, folders=inputs.folders | {"exchange": out}))
     changed = {name for name in REPLACED if after[name] != inputs[name]}
@@ -122,5 +123,5 @@ def test_nothing_is_solved_again_without_a_texture_or_by_the_papers_solver(tmp_p
         write_json(tmp_path / "plain" / "texture.json", TextureTable())
         inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"texture": tmp_path / "plain"})
     out = ran(exchange, inputs, tmp_path / "out", solve=stages.solve.Params(solver=solver))
-    assert read_result(out / EXCHANGE_FILE, Exchange, "exchange") == Exchange(False)
-    assert [path.name for path in out.iterdir()] == [EXCHANGE_FILE]
+    assert read_result(out / FILE, Exchange, "exchange") == Exchange(False)
+    assert [path.name for path in out.iterdir()] == [FILE]

@@ -14,7 +14,7 @@ from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
-from factorlib.results.texture_table import SurfaceTable, read_surface
+from factorlib.results.surface_table import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent
 from factorlib.urm.extract import read_geometry, with_surface_normals
 from factorlib.urm.observations import Observations, read_observations, write_observations

@@ -13,8 +13,8 @@ from factorlib.geometry.ground import Plane
 from factorlib.geometry.occlusion import Occluders
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.urm import cast_shadows as patches
+from factorlib.urm.background import RIM, ROWS, surrounding_radiance
 from factorlib.urm.cast_shadows import GroundView, ground_observations
-from factorlib.urm.extract import RIM, ROWS, surrounding_radiance
 
 CAMERA = Camera(320, 240, 300.0, (160.0, 120.0))
 UP = np.array([0.0, -np.cos(0.6), -np.sin(0.6)])  # the camera looks down by 34°
