@@ -24,6 +24,16 @@ def silent(done: float, total: float, text: str = "") -> None:
     """Ignore the progress of a stage that a notebook or a test calls."""
 
 
+def part_of(progress: Progress, begin: float, end: float) -> Progress:
+    """Return a callback that reports its progress as that between two shares of the whole."""
+
+    def report(done: float, total: float, text: str = "") -> None:
+        """Report a part's progress."""
+        progress(begin + (end - begin) * done / max(total, 1e-9), 1, text)
+
+    return report
+
+
 def serial_map(function: Callable, items: Iterable) -> list:
     """Apply a function to the items in this process and return all results in order."""
     return [function(item) for item in items]

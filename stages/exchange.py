@@ -34,7 +34,7 @@ from factorlib.results.exchange import FILE, REPLACED, Exchange
 from factorlib.results.surface_table import BEGINNING
 from factorlib.results.surface_table import FILE as SURFACE
 from factorlib.results.texture_table import TextureTable, read_table
-from factorlib.stage import Inputs, Progress, silent
+from factorlib.stage import Inputs, Progress, part_of, silent
 from factorlib.urm.extract import read_geometry
 
 SHARES = (0.6, 0.75)  # shares of the time at which the solve and the shading end
@@ -153,13 +153,3 @@ def held_out_loss(table: TextureTable, kept: TextureTable) -> float:
 def with_folders(inputs: Inputs, **folders: Path) -> Inputs:
     """Return the inputs with other folders of some stages."""
     return msgspec.structs.replace(inputs, folders={**inputs.folders, **folders})
-
-
-def part_of(progress: Progress, begin: float, end: float) -> Progress:
-    """Return a callback that reports its progress as that between two shares of the whole."""
-
-    def report(done: float, total: float, text: str = "") -> None:
-        """Report a part's progress."""
-        progress(begin + (end - begin) * done / max(total, 1e-9), 1, text)
-
-    return report

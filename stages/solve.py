@@ -5,7 +5,7 @@ coverage/<illumination>.exr.
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -21,9 +21,9 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.inference import options
 from factorlib.inference.answer import Answer
-from factorlib.inference.blocks import Noise
+from factorlib.inference.blocks import Block, Noise
 from factorlib.inference.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
-from factorlib.inference.held_out_photos import fit_held_out_lights, predicted_exposures
+from factorlib.inference.held_out_photos import fit_lights_given_materials, predicted_exposures
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.known import extract_known
@@ -54,8 +54,8 @@ from factorlib.reflection.operator import Name
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Channels, Model, vec3
 from factorlib.results.solution import EarlierSolution, read_earlier_solution
-from factorlib.results.surface_table import BEGINNING
-from factorlib.stage import Inputs, Progress
+from factorlib.results.surface_table import BEGINNING, read_surface
+from factorlib.stage import Inputs, Progress, part_of
 from factorlib.urm import observations as urm
 
 log = logging.getLogger("factorlib.inference")
@@ -63,6 +63,7 @@ PAPER = PaperOptions()  # defaults of the paper's solver
 # Shares of the stage's time on data/eames.
 READING = 0.03
 ERRORS = 0.07  # standard errors
+LIGHT_COST = 0.4  # of a light that is fitted alone, in those of one that takes part in the solve
 
 
 class Params(options.SolveOptions, frozen=True, forbid_unknown_fields=True):
@@ -103,7 +104,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress, decided:
     read = count(1)
     check(params)
     declared = _known_values(params, inputs)
-    names_solved = solved_photos(msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice]))
+    slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    selected = read_surface(inputs.folders.get("surface")).lights
+    names_solved = {
+        name: slices[name].illumination
+        for name in solved_photos(slices)
+        if selected is None or slices[name].illumination in {*selected, *declared.maps, *declared.balls}
+    }
     files = sorted(inputs["urm"].glob("*.parquet"))
     photos = gather_observations(
         files,
@@ -114,6 +121,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress, decided:
     )
     solved = [photo for photo, file in zip(photos, files, strict=True) if file.stem in names_solved]
     _warn(unusable_observations(solved))
+    # share of the time until lights are fitted one by one
+    apart = {light.illumination for light in slices.values()} - set(names_solved.values())
+    share = 1 / (1 + LIGHT_COST * len(apart) / max(len(set(names_solved.values())), 1))
+    progress, last = part_of(progress, 0, share), part_of(progress, share, 1)
     observations = urm.with_exposures(urm.concatenate([photo.merged for photo in solved]), declared.exposure)
     relative = urm.relative_exposures(observations)
     earlier = (
@@ -136,9 +147,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress, decided:
     write_json(out / "materials.json", answer.material_table())
     write_json(out / "uncertainty.json", answer.uncertainty())
     everything = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
-    lights, exposures = _held_out_photos(params, inputs, everything, answer, progress)
-    write_lobes(out / "lobes.parquet", answer.lights() | lights)
-    write_json(out / "exposures.json", answer.exposures() | exposures)
+    unsolved = UnsolvedPhotos(params, inputs, everything, answer)
+    lights, exposures = unsolved.lights_and_exposures(slices, names_solved, last)
+    write_lobes(out / "lobes.parquet", lights)
+    write_json(out / "exposures.json", exposures)
     write_rows(out / "convergence.parquet", Event, solution.history)
     (out / "coverage").mkdir()
     for name, coverage in coverages.items():
@@ -256,43 +268,76 @@ def _run_solver(
     return solve(problem, start, choices, FitRunner(unfinished, solve_progress(progress)), decided)
 
 
-def _held_out_photos(
-    params: Params, inputs: Inputs, observations: urm.Observations, answer: Answer, progress: Progress
-) -> tuple[dict[str, Lobes], dict[str, Channels]]:
-    """Return the exposures of held-out photos, and lights that no solved photo shows.
+class UnsolvedPhotos(msgspec.Struct, frozen=True):
+    """Observations of all photos, some of which had no part in a solution.
 
-    Args:
+    Attributes:
         params: Parameters of the stage.
         inputs: Inputs of the stage.
         observations: Observations of all photos.
-        answer: Solution of the other photos.
-        progress: Called with the completed work, its total and the current activity.
+        answer: Solution.
     """
-    slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    solved = {name: slices[name].illumination for name in solved_photos(slices)}
-    held_out = {name: light.illumination for name, light in slices.items() if light.held_out}
-    solved_lights = set(answer.lights())
-    shared = {name: light for name, light in held_out.items() if light in solved_lights}
-    exposures = predicted_exposures(observations, shared, solved, answer.exposures())
-    # photos of lights that no solved photo shows; a black or empty one gets no light, as `export` says
-    numbers = [k for k, name in enumerate(observations.photos) if name in held_out and name not in shared]
-    apart = usable_observations(observations.take(np.isin(observations.photo, numbers)))
-    if not (apart.radiance > 0).any():
-        return {}, exposures
-    worlds = {n: np.array(s.world_from_camera) for n, s in slices.items() if s.world_from_camera is not None}
-    relative = urm.relative_exposures(apart)
-    blocks = blocks_of_observations(
-        urm.at_one_exposure(apart, relative),
-        Noise(),
-        held_out=0.0,
-        world_from_camera=worlds,
-        seed=params.seed,
-        backgrounds=read_backgrounds(inputs["urm"], relative),
-    )
-    problem = JointProblem(blocks, answer.problem.operator, inputs.map)
-    progress(1, 1, "lights of held-out photos")
-    lights, factors = fit_held_out_lights(problem, answer.solution, params)
-    return lights, exposures | {photo: vec3(relative[photo] * np.array(factor)) for photo, factor in factors.items()}
+
+    params: Params
+    inputs: Inputs
+    observations: urm.Observations
+    answer: Answer
+
+    def lights_and_exposures(
+        self, slices: Mapping[str, LightSlice], solved: Mapping[str, str], progress: Progress
+    ) -> tuple[dict[str, Lobes], dict[str, Channels]]:
+        """Return all lights, and the exposures of all photos.
+
+        Args:
+            slices: Illumination of each photo.
+            solved: Illumination of each photo of the solution.
+            progress: Called with the completed work, its total and the current activity.
+        """
+        # photos of lights that were not selected, then those held-out photos whose light no other photo shows
+        further = {name: slices[name].illumination for name in solved_photos(slices) if name not in solved}
+        lights, exposures = self.fit_lights(further, progress)
+        lights, exposures = self.answer.lights() | lights, self.answer.exposures() | exposures
+        held_out = {name: light.illumination for name, light in slices.items() if light.held_out}
+        shared = {name: light for name, light in held_out.items() if light in lights}
+        exposures |= predicted_exposures(self.observations, shared, {**solved, **further}, exposures)
+        apart = self.fit_lights(held_out.keys() - shared.keys(), progress)
+        return lights | apart[0], exposures | apart[1]
+
+    def fit_lights(self, photos: Collection[str], progress: Progress) -> tuple[dict[str, Lobes], dict[str, Channels]]:
+        """Fit the lights of photos one by one, given the materials, and return them with the photos' exposures.
+
+        A black or empty photo gets no light, as `export` says.
+        """
+        numbers = [k for k, name in enumerate(self.observations.photos) if name in photos]
+        apart = usable_observations(self.observations.take(np.isin(self.observations.photo, numbers)))
+        if not (apart.radiance > 0).any():
+            return {}, {}
+        slices = msgspec.convert(self.inputs.facts["dataset.light"], dict[str, LightSlice])
+        relative = urm.relative_exposures(apart)
+        blocks = blocks_of_observations(
+            urm.at_one_exposure(apart, relative),
+            Noise(),
+            held_out=0.0,
+            world_from_camera={n: np.array(s.world_from_camera) for n, s in slices.items() if s.world_from_camera},
+            seed=self.params.seed,
+            backgrounds=read_backgrounds(self.inputs["urm"], relative),
+        )
+        fitted = count(1)
+        folder = self.inputs.unfinished
+
+        def fit(block: Block) -> tuple[dict[str, Lobes], dict[str, Channels]]:
+            """Fit one light."""
+            problem = JointProblem([block], self.answer.problem.operator)
+            unfinished = Checkpoint(folder / f"{block.name}.pt" if folder else None)
+            lights, factors = fit_lights_given_materials(problem, self.answer.solution, self.params, unfinished)
+            progress(next(fitted), len(blocks), f"light of {block.name}, given the materials")
+            return lights, {photo: vec3(relative[photo] * np.array(factor)) for photo, factor in factors.items()}
+
+        lights, exposures = dict[str, Lobes](), dict[str, Channels]()
+        for light, exposure in self.inputs.map(fit, blocks):
+            lights |= light
+            exposures |= exposure
+        return lights, exposures
 
 
 def _surface_start(inputs: Inputs, problem: JointProblem) -> Start | None:

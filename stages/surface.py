@@ -4,10 +4,14 @@ Materials and lights are fitted as at the start of the solve.  Normals then turn
 turns are kept only if they improve held-out photos (`factorlib.inference.surface_detail`).  Factors on the diffuse
 reflectance are chosen likewise, in addition to the turns.
 
+Where photos show more lights than `Params.lights`, the ones that tell most of the materials are selected here, for
+`solve` as well (`factorlib.inference.light_selection`).
+
 Writes surface.json, and beginning.json: materials and lights of the first fit, from which `solve` continues.  If
 surfaces differ, it writes photos/<photo>.exr: normals, which later stages use instead of those of `align`, and factors.
 """
 
+from collections import defaultdict
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,6 +23,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import write_exr
 from factorlib.inference.aligned_photo import AlignedPhoto, read_aligned_photos, visible_meshes
 from factorlib.inference.blocks import Noise
+from factorlib.inference.light_selection import Counts, count_by_side, select_lights
 from factorlib.inference.observed import blocks_of_observations, read_backgrounds, usable_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
@@ -51,26 +56,34 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Normals and albedo factors by shading; auto: used if they improve held-out photos."""
     observations: Annotated[int, msgspec.Meta(ge=200)] = 2000
     """Number of a photo's observations, drawn at random, that turns are estimated from."""
+    lights: Annotated[int, msgspec.Meta(ge=1)] = 16
+    """Largest number of lights that surface and materials are estimated from.  Further lights are fitted one by one,
+    given the materials."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
     """Seed of the observations that are drawn and of those that are held out."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Estimate the surface detail of all meshes, and write it if it is kept."""
-    if params.shape == "off":
-        write_json(out / FILE, SurfaceTable())
-        return
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     photos = read_aligned_photos(inputs, slices)
-    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
-    surfaces = Surfaces({name: subdivided_mesh(mesh) for name, mesh in visible_meshes(read, slices).items()})
-    if not surfaces.meshes:
-        write_json(out / FILE, SurfaceTable())
-        return
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    fitted = sorted(solved_photos(lights))
-    observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in fitted}
-    refuse_left_out({name: photos[name] for name in fitted}, observations)
+    solved = {name: photos[name] for name in sorted(solved_photos(lights))}
+    observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in solved}
+    refuse_left_out(solved, observations)
+    counts = defaultdict[str, Counts](Counts)
+    for name, pixels in observations.items():
+        counts[lights[name].illumination] += count_by_side(photos[name], pixels)
+    selected = select_lights(counts, params.lights) if len(counts) > params.lights else None
+    unchanged = SurfaceTable(lights=selected)
+    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    meshes = visible_meshes(read, slices) if params.shape != "off" else {}
+    if not meshes:
+        write_json(out / FILE, unchanged)
+        return
+    surfaces = Surfaces({name: subdivided_mesh(mesh) for name, mesh in meshes.items()})
+    if selected is not None:
+        observations = {name: o for name, o in observations.items() if lights[name].illumination in selected}
     attached = {
         name: photos[name].attach(np.column_stack([pixels.x, pixels.y]), surfaces)
         for name, pixels in observations.items()
@@ -90,14 +103,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         (out / "photos").mkdir()
         for name, photo in photos.items():
             write_exr(out / "photos" / f"{name}.exr", photo.detail_channels(surfaces, detail))
-    by_mesh = [
-        {name: values.tolist() for name, values in values_by_mesh.items()}
-        for values_by_mesh in (displacements, factors)
-    ]
     table = SurfaceTable(
-        bool(displacements), DetailEvidence.from_decision(result.evidence, result.stiffness.turn),
-        bool(factors), DetailEvidence.from_decision(result.painted, result.stiffness.factor), result.gains, *by_mesh,
-    )  # fmt: skip
+        bool(displacements),
+        DetailEvidence.from_decision(result.evidence, result.stiffness.turn),
+        bool(factors),
+        DetailEvidence.from_decision(result.painted, result.stiffness.factor),
+        result.gains,
+        {name: values.tolist() for name, values in displacements.items()},
+        {name: values.tolist() for name, values in factors.items()},
+        selected,
+    )
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
     progress(1, 1)

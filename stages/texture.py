@@ -243,14 +243,15 @@ def detail_channels(
     names: list[str],
 ) -> Channels:
     """Return detail.R, .G, .B of a photo: the texture, elsewhere the detail of `surface`; 0 without a mesh."""
-    y, x = np.nonzero(photo.geometry["object"] > 0.5)
-    label = np.rint(photo.geometry["label"][y, x]).astype(int)
-    values = np.stack([geometry.get(channel, np.ones(photo.geometry["object"].shape))[y, x] for channel in DETAIL], 1)
+    shape = geometry["object"].shape
+    y, x = np.nonzero(geometry["object"] > 0.5)
+    label = np.rint(geometry["label"][y, x]).astype(int)
+    values = np.stack([geometry.get(channel, np.ones(shape))[y, x] for channel in DETAIL], 1)
     for mesh, rows, operator in attach_to_meshes(photo, np.column_stack([x, y]), fine):
         for material in np.unique(label[rows]).tolist():
             if (mesh, names[material - 1]) in factors:
                 one = np.flatnonzero(label[rows] == material)
                 values[rows[one]] = operator[one] @ factors[mesh, names[material - 1]]
-    picture = np.zeros((*photo.geometry["object"].shape, 3), np.float32)
+    picture = np.zeros((*shape, 3), np.float32)
     picture[y, x] = values
     return dict(zip(DETAIL, np.moveaxis(picture, -1, 0)))

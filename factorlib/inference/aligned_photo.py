@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -20,17 +21,23 @@ from factorlib.urm.extract import Channels
 
 
 class AlignedPhoto(msgspec.Struct, frozen=True):
-    """Photo as written by `align`: its maps, its objects and their poses."""
+    """Photo as written by `align`: the file of its maps, its objects and their poses."""
 
-    geometry: Channels
+    maps: Path
     objects: ObjectsSlice
     poses: PhotoPoses
 
+    @property
+    def geometry(self) -> Channels:
+        """Maps of the photo, read from their file at every use: those of a hundred photos do not fit into memory."""
+        return read_exr(self.maps)
+
     def attach(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> SurfacePositions:
         """Return the positions of pixels (x, y) on the surfaces."""
-        height, width = self.geometry["object"].shape
+        number = self.geometry["object"]
+        height, width = number.shape
         objects = {entry.name: (entry.mesh, self.poses.objects[entry.name]) for entry in self.objects.objects}
-        object_number = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
+        object_number = np.rint(number[pixels[:, 1], pixels[:, 0]]).astype(int)
         return attach_pixels(pixels, object_number, self.poses.camera.camera(width, height), objects, surfaces)
 
     def detail_channels(self, surfaces: Surfaces, detail: Detail) -> Channels:
@@ -38,13 +45,14 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
 
         All are 0 at pixels without a mesh.
         """
-        y, x = np.nonzero(self.geometry["object"] > 0.5)
+        geometry = self.geometry
+        y, x = np.nonzero(geometry["object"] > 0.5)
         normal, view = (
-            np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
+            np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
             for kind in ("normal", "view")
         )
         attached = self.attach(np.column_stack([x, y]), surfaces)
-        picture = np.zeros((*self.geometry["object"].shape, 6), np.float32)
+        picture = np.zeros((*geometry["object"].shape, 6), np.float32)
         picture[y, x, :3] = attached.turn_normals(normal, view, detail.turn)
         picture[y, x, 3:] = attached.factor(detail.log_factor)
         names = [*(f"normal.{axis}" for axis in "xyz"), *(f"detail.{channel}" for channel in "RGB")]
@@ -54,10 +62,7 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
 def read_aligned_photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, AlignedPhoto]:
     """Return all photos as written by `align`, sorted by name."""
     poses = read_poses(inputs["align"] / POSES)
-    return {
-        name: AlignedPhoto(read_exr(inputs["align"] / f"{name}.exr"), slices[name], poses[name])
-        for name in sorted(slices)
-    }
+    return {name: AlignedPhoto(inputs["align"] / f"{name}.exr", slices[name], poses[name]) for name in sorted(slices)}
 
 
 def pixel_on_mesh(name: str, mesh: Mesh, photos: Mapping[str, AlignedPhoto]) -> float | None:
@@ -65,8 +70,9 @@ def pixel_on_mesh(name: str, mesh: Mesh, photos: Mapping[str, AlignedPhoto]) -> 
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     sizes = []
     for photo in photos.values():
+        geometry = photo.geometry
         for number, entry in enumerate(photo.objects.objects, start=1):
-            depth = photo.geometry["depth"][np.rint(photo.geometry["object"]) == number]
+            depth = geometry["depth"][np.rint(geometry["object"]) == number]
             if entry.mesh == name and len(depth):
                 sizes.append(float(np.median(depth)) / photo.poses.camera.focal_px / extent)
     return float(np.median(sizes)) if sizes else None

@@ -1,6 +1,9 @@
-"""Lights and exposures of held-out photos, given the materials of a solve.
+"""Lights and exposures of photos that take no part in a solve, given its materials.
 
-A held-out photo takes no part in the solve, which predicts it.  If solved photos share its light, it has that light.
+These are held-out photos, and those of lights that were not selected (`factorlib.inference.light_selection`).  The
+latter have their lights fitted.
+
+A held-out photo is predicted.  If solved photos share its light, it has that light.
 Its exposure relative to them is that of EXIF or `known` where both have one, and else 1.  Otherwise its
 light is fitted to its own pixels and surroundings with the materials fixed, so that it tests materials and shape alone.
 """
@@ -12,6 +15,7 @@ from collections.abc import Mapping
 import msgspec
 import numpy as np
 
+from factorlib.checkpoint import Checkpoint
 from factorlib.inference.fit import FitSchedule, initial_fit
 from factorlib.inference.fit_runner import FitRunner, Solution, SolveState
 from factorlib.inference.joint_solver import CHOICES, FITS, SolveRequest
@@ -24,11 +28,12 @@ from factorlib.light.lobes import Lobes
 from factorlib.results.materials import Channels, vec3
 from factorlib.urm.observations import Observations
 
+LIGHT_STEPS = {name: FITS[name] for name in ("lights", "suns")}
 FROM_CONSTANT = FitSchedule(light_steps=10, materials_fixed=True)
 
 
-def fit_held_out_lights(
-    problem: JointProblem, solution: Solution, options: SolveOptions
+def fit_lights_given_materials(
+    problem: JointProblem, solution: Solution, options: SolveOptions, checkpoint: Checkpoint = Checkpoint(None)
 ) -> tuple[dict[str, Lobes], dict[str, Channels]]:
     """Fit lights to the photos of a problem, with the materials of a solution, and return them with the exposures.
 
@@ -36,9 +41,10 @@ def fit_held_out_lights(
     some: otherwise the scale of its materials is arbitrary, and that of a background is not.
 
     Args:
-        problem: Observations of held-out photos whose lights no solved photo shows.
+        problem: Observations of photos whose lights no solved photo shows.
         solution: Result of the solver.
         options: Options of the user.
+        checkpoint: File of the states.
 
     Returns:
         The lobes by illumination, in scene radiance, and each photo's factor on its light.
@@ -47,18 +53,21 @@ def fit_held_out_lights(
     problem = msgspec.structs.replace(problem, known=KnownValues(dict(enumerate(materials.rows()))))
     if not any(decision.accepted for decision in solution.backgrounds):
         problem = problem.keep_backgrounds([])
-    run = FitRunner(prior=solution.prior)
+    run = FitRunner(checkpoint, prior=solution.prior)
     start = Point(materials, [constant_light(block, materials, options.cells) for block in problem.blocks])
     first = initial_fit(start)
     state = SolveState(first, first, solution.shadows, solution.interreflection, observations=solution.observations)
-    request = SolveRequest(problem, [first], options, run)
-    fit = run.fit("lights", request.light_problem(state), first, FROM_CONSTANT)
-    steps = {"background": CHOICES["background"], "lights": FITS["lights"]}
-    point = run.run_steps(steps, request, state.with_fit(fit)).fit.point
+    steps = {"start": fit_from_constant, "background": CHOICES["background"]} | LIGHT_STEPS
+    point = run.run_steps(steps, SolveRequest(problem, [first], options, run), state).fit.point
     pairs = list(zip(problem.blocks, point.lights, strict=True))
     lobes = {block.name: light.lobes.scale(block.unit) for block, light in pairs}
     factors = [pair for block, light in pairs for pair in zip(block.photos, np.exp(light.log_exposure), strict=True)]
     return lobes, {photo: vec3([factor] * 3) for photo, factor in factors}
+
+
+def fit_from_constant(request: SolveRequest, state: SolveState) -> SolveState:
+    """Fit lights from constant ones."""
+    return state.with_fit(request.run.fit("lights", request.light_problem(state), state.fit, FROM_CONSTANT))
 
 
 def predicted_exposures(

@@ -48,6 +48,7 @@ class SurfaceTable(msgspec.Struct, frozen=True):
         displacements: by mesh: along the normal at each node of the subdivided mesh (`meshes.subdivision`), in
             units of the mesh's extent
         log_factors: by mesh: log factor on diffuse reflectance at each node, per channel
+        lights: lights that surface and materials are estimated from; None for all
     """
 
     moved: bool = False
@@ -57,6 +58,7 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     gains: dict[str, float] = {}
     displacements: dict[str, list[float]] = {}
     log_factors: dict[str, list[tuple[float, float, float]]] = {}
+    lights: list[str] | None = None
 
     @property
     def disagreement(self) -> float | None:

@@ -20,7 +20,7 @@ from factorlib.inference.cast_shadows import CastShadows, cast_shadows
 from factorlib.inference.fit import Hyperparameters, initial_fit, light_likelihood
 from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
-from factorlib.inference.held_out_photos import fit_held_out_lights
+from factorlib.inference.held_out_photos import fit_lights_given_materials
 from factorlib.inference.joint_solver import LIGHTS, solve
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import select_grounds
@@ -143,11 +143,11 @@ def test_a_held_out_photo_gets_its_light_as_the_solve_does(lit, monkeypatch):
     alone = lit.select_lights([2])
     dark = lit.with_blocks([darkened(lit.blocks[2])])
     given, without, doubtful = (
-        fit_held_out_lights(each, solution, QUICK)[0]["room2"].weight
+        fit_lights_given_materials(each, solution, QUICK)[0]["room2"].weight
         for each in (alone, alone.keep_backgrounds([]), dark)
     )
     np.testing.assert_allclose(doubtful, without, rtol=0.02)
-    assert np.abs(np.log(given / without)).max() > 0.1 and schedules[-1] is LIGHTS
+    assert np.abs(np.log(given / without)).max() > 0.1 and any(each is LIGHTS for each in schedules)
 
 
 def test_the_solver_of_the_paper_ignores_backgrounds_and_keeps_its_gauge(lit):

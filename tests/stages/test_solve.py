@@ -13,12 +13,13 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.observed import blocks_of_observations
-from factorlib.jsonfile import read_json
+from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, lobe_energy
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobe_table import read_lobes
+from factorlib.results.surface_table import FILE, SurfaceTable
 from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_normals
 from factorlib.stage import Inputs
 from factorlib.urm.observations import Observations, write_observations
@@ -48,6 +49,8 @@ def run(folder, photos, progress=None, unfinished=None, start=None, light=None, 
         write_observations(urm / f"{name}.parquet", part)
     light = light or {name: {"illumination": name, "world_from_camera": None} for name in photos}
     folders = {"urm": urm, "train": SHIPPED} | ({"start": start} if start else {})
+    if (folder / "surface").is_dir():
+        folders["surface"] = folder / "surface"
     facts = {"dataset.materials": list(NAMES), "dataset.light": light, "dataset.known": known or {}}
     inputs = Inputs(folders, facts, files or {}, unfinished=unfinished)
     joint = {"cells": 24, "splittings": 0, "observations": 150, "tone": "off"}
@@ -269,6 +272,24 @@ def test_a_held_out_photo_changes_no_answer_and_is_predicted(tmp_path, linked, s
     material = table(out)["materials"]["green"]
     reflectance = np.add(material["diffuse"], material["specular"]) / (MATERIALS.diffuse + MATERIALS.specular)[1]
     np.testing.assert_allclose(energy * reflectance / true, 1, atol=0.25)
+
+
+def test_lights_that_were_not_selected_are_fitted_to_the_materials_of_the_others(tmp_path, linked, solved):
+    """By the photos that are not held out alone."""
+    same_light = msgspec.structs.replace(observations("e", [1], 3), illuminations=("d",))
+    photos = linked | {"d": observations("d", [1], 7), "e": same_light}
+    light = {name: {"illumination": name, "world_from_camera": None} for name in "abd"}
+    lobes = []
+    for chosen in (photos, {name: photos[name] for name in "abd"}):
+        folder = tmp_path / str(len(chosen))
+        (folder / "surface").mkdir(parents=True)
+        write_json(folder / "surface" / FILE, SurfaceTable(lights=["a", "b"]))
+        held_out = {"e": {"illumination": "d", "world_from_camera": None, "held_out": True}} if "e" in chosen else {}
+        out = run(folder, chosen, light=light | held_out)
+        assert (out / "materials.json").read_bytes() == (solved / "materials.json").read_bytes()
+        assert read_json(out / "exposures.json") == {name: [1.0] * 3 for name in chosen}
+        lobes.append((out / "lobes.parquet").read_bytes())
+    assert lobes[0] == lobes[1] and set(read_lobes(out / "lobes.parquet")) == {"a", "b", "d"}
 
 
 def test_the_background_of_a_held_out_photo_tells_its_light(tmp_path, linked):

@@ -15,7 +15,7 @@ from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.results.surface_table import SurfaceTable, read_surface
-from factorlib.stage import Inputs, serial_map, silent
+from factorlib.stage import serial_map, silent
 from factorlib.urm.extract import read_geometry, with_surface_normals
 from factorlib.urm.observations import Observations, read_observations, write_observations
 from stages import surface
@@ -77,7 +77,7 @@ def test_all_choices_of_materials_of_a_textured_mesh_have_the_same_faces(tmp_pat
     write_ply(tmp_path / "ball.ply", sphere(1.0))
     dense = subdivided_mesh(read_mesh(tmp_path / "ball.ply", ["red"], "red"), 0.03)
     textures = {"ball": (0.03, {"red": np.full((dense.nodes, 3), 0.5)})}
-    read = MeshCache(lambda _, file: tmp_path / file, ["red", "blue"], CREASE_DEG, textures=textures)
+    read = MeshCache(lambda _, file: tmp_path / file, ["red", "white"], CREASE_DEG, textures=textures)
     red, blue = (read.mesh("ball", MeshEntry("ball.ply", material="red"), {"ball": m}) for m in ("red", "blue"))
     assert np.array_equal(red.faces, blue.faces) and np.unique(red.detail) == 0.5 and blue.detail is None
 
@@ -119,10 +119,12 @@ def test_the_last_digits_of_estimated_normals_decide_nothing(tmp_path):
     assert 0 < np.abs(first.normal - second.normal).max() < 0.01
 
 
-def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
-    ran(surface, Inputs({}), tmp_path, shape="off")
-    assert read_surface(tmp_path) == SurfaceTable() == read_surface(None)
-    assert [path.name for path in tmp_path.iterdir()] == ["surface.json"]
+def test_off_changes_nothing_and_selects_lights_where_there_are_many(tmp_path):
+    inputs = make_artifacts(Made(tmp_path, {"day": ["red"], "noon": ["red", "white"]}))
+    assert read_surface(ran(surface, inputs, tmp_path / "all", shape="off")) == SurfaceTable() == read_surface(None)
+    out = ran(surface, inputs, tmp_path / "one", shape="off", lights=1)
+    assert read_surface(out) == SurfaceTable(lights=["noon"])
+    assert [path.name for path in out.iterdir()] == ["surface.json"]
 
 
 def test_without_any_observation_the_doubtful_poses_are_named_that_were_left_out(tmp_path):
