@@ -77,7 +77,7 @@ def test_all_choices_of_materials_of_a_textured_mesh_have_the_same_faces(tmp_pat
     write_ply(tmp_path / "ball.ply", sphere(1.0))
     dense = subdivided_mesh(read_mesh(tmp_path / "ball.ply", ["red"], "red"), 0.03)
     textures = {"ball": (0.03, {"red": np.full((dense.nodes, 3), 0.5)})}
-    read = MeshCache(lambda _, file: tmp_path / file, ["red", "white"], CREASE_DEG, textures=textures)
+    read = MeshCache(lambda _, file: tmp_path / file, ["red", "blue"], CREASE_DEG, textures=textures)
     red, blue = (read.mesh("ball", MeshEntry("ball.ply", material="red"), {"ball": m}) for m in ("red", "blue"))
     assert np.array_equal(red.faces, blue.faces) and np.unique(red.detail) == 0.5 and blue.detail is None
 
