@@ -30,8 +30,9 @@ from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
 from factorlib.labels.label_image import describe_specks
 from factorlib.labels.mask_files import read_inside, read_labels_in, read_values
+from factorlib.onboarding.light_groups import Kind, kind_of_light
 from factorlib.onboarding.matte import MOST_DOUBT, MatteModel, foreground, opaque_pixels
-from factorlib.onboarding.parts import find_parts
+from factorlib.onboarding.parts import PatchObservations, find_parts, observe_patches
 from factorlib.onboarding.photo_folder import Cameras
 from factorlib.shapes.gaps import mend_gaps
 from factorlib.shapes.hull import agreement, agreements, focal_by_hull, hull_box
@@ -60,6 +61,18 @@ UNPLACED = (
     "left out, for structure from motion does not place them: {}; they are blurred, turned, or of another thing, or no "
     "photo overlaps with them: add photos between them and the others, each 10 to 20° from the next"
 )
+ASSUMED_LIGHT = (
+    "one light at rest is assumed: where photos have different ones, delete `illumination: room`; where the thing "
+    "turned before a camera at rest, delete `world_from_camera: true`"
+)
+LIGHT_NOTES: dict[Kind, str] = {
+    "world": "all photos show one light at rest, `illumination: room` (lights of their own would explain {:.0%} of "
+    "radiance): where they have different ones, delete it",
+    "camera": "the thing turned before a camera and a light at rest, `illumination: room` (lights at rest in the "
+    "thing's world are wrong by {:.0%} of radiance): where it did not, add `world_from_camera: true` to `cameras`",
+    "photo": "each photo has its own light (one for all is wrong by {:.0%} of radiance): give those that share one the "
+    "same `illumination`",
+}
 NAMES = "rename materials and meshes in dataset.yaml now, if at all: another name later makes all steps run again"
 
 
@@ -121,24 +134,27 @@ def dataset_from_photos(
         folder = Path(temporary)
         views = read_views(images, masks, model, folder, lambda share, text: report(share / 2, text))
         visible = {name: view for name, view in views.items() if view.small.objects.any()}
-        if source:
-            cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
-        elif not meshes:
-            cameras, outlines = cameras_of_motion(visible, report)
+        if not source and not meshes:
+            relative = {name: path.relative_to(photos) for name, path in images.items()}
+            cameras = cameras_of_motion(visible, relative, folder, report)
             for name in cameras.left_out:
                 del views[name], visible[name]
                 (folder / "masks" / f"{name}.png").unlink()
+            source = cameras if cameras.source else None
+        if source:
+            cameras, outlines = cameras_of_folder(visible, images, source, folder, report)
         views, outlines = refine_masks(
             views, outlines, model, folder, lambda share, text: report(0.9 + share / 20, text)
         )
         report(0.95, "gaps of the masks")
         whole_outlines, gaps = mend_gaps(outlines)
         proposed = []
-        if not (whole or meshes) and len(outlines) >= LEAST_VIEWS:
-            proposed = label_parts(
-                whole_outlines, {name: images[name] for name in visible}, folder,
-                lambda share: report(0.95 + share / 20, "parts by colour"),
-            )  # fmt: skip
+        if outlines:
+            report(0.95, "lights and parts")
+            seen = SeenSurface(whole_outlines, {name: images[name] for name in visible})
+            cameras = seen.with_lights(cameras)
+            if not (whole or meshes) and len(outlines) >= LEAST_VIEWS:
+                proposed = seen.label_parts(folder, lambda share: report(0.95 + share / 20, "parts by colour"))
         if unknown := not cameras.source and not meshes:
             shape = outlined_shape(visible, report)
             cameras = shape if shape.revolved else cameras
@@ -228,10 +244,7 @@ def cameras_of_folder(
         """Return the outlines, by another focal length if it is given."""
         return [view.outline(name, images[name], focal) for name, view in views.items() if name in images]
 
-    notes = [
-        "one light at rest is assumed: where photos have different ones, delete `illumination: room`; where the thing "
-        "turned before a camera at rest, delete `world_from_camera: true`"
-    ]
+    notes = list(cameras.notes)
     images = match_source(paths, cameras)
     content = json.loads(cameras.files[0].read_text()) if "transforms" in cameras.source else {}
     if content and not any(key in lens for lens in (content, *content["frames"]) for key in ("fl_x", "camera_angle_x")):
@@ -246,13 +259,8 @@ def cameras_of_folder(
         write_json(file, content | {"fl_x": round(focal, 1)})
         notes.append(f"the cameras have no focal length: a hull fits the masks best at {focal:.0f} px, which is used")
         images = match_source(paths, cameras)
-    by_photo = {
-        name: {"illumination": "room"} | distorted_camera(images[name], view.size[1])
-        for name, view in views.items()
-        if name in images
-    }
-    source = cameras.source | {"world_from_camera": True}
-    return msgspec.structs.replace(cameras, source=source, by_photo=by_photo, notes=notes), outlines()
+    by_photo = {name: distorted_camera(images[name], view.size[1]) for name, view in views.items() if name in images}
+    return msgspec.structs.replace(cameras, by_photo=by_photo, notes=notes), outlines()
 
 
 def match_source(paths: Mapping[str, Path], cameras: Cameras) -> dict[str, SourceImage]:
@@ -298,28 +306,37 @@ def distorted_camera(image: SourceImage, width: int) -> dict[str, Any]:
     }
 
 
-def cameras_of_motion(views: Mapping[str, View], report: Report) -> tuple[Cameras, list[Outline]]:
-    """Return the source `sfm`, and outlines by its cameras; no source where photos do not overlap, but what would help.
+def cameras_of_motion(views: Mapping[str, View], paths: Mapping[str, Path], folder: Path, report: Report) -> Cameras:
+    """Write the cameras of structure from motion as transforms.json; no source where photos do not overlap.
 
     Photos that are not placed are left out, if they are fewer than the others.
 
     Args:
         views: the photos with a foreground
+        paths: path of each photo
+        folder: a temporary folder
         report: called with the completed share and the current activity
     """
     photos = {name: view.small for name, view in views.items()}
     try:
-        registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.4 * share, text))
+        registered = cameras_by_motion(photos, lambda share, text: report(0.5 + 0.35 * share, text))
     except InputError as error:
-        return Cameras(notes=[f"{error.fault}: {error.cure}"]), []
+        return Cameras(notes=[f"{error.fault}: {error.cure}"])
     missing = [name for name in photos if name not in registered] if 2 * len(registered) > len(photos) else []
+    frames = []
+    for name, camera in registered.items():
+        height, width = views[name].size
+        focal, k1 = camera.distortion or (camera.focal, 0.0)
+        world_from_camera = camera.pose.rotation.T
+        matrix = np.column_stack([world_from_camera * [1, -1, -1], -world_from_camera @ camera.pose.translation])
+        frames.append({
+            "file_path": str(paths[name]), "w": width, "h": height, "k1": k1,
+            "fl_x": focal * width / photos[name].camera.width, "transform_matrix": matrix.tolist(),
+        })  # fmt: skip
+    write_json(folder / "transforms.json", {"frames": frames})
     notes = [UNPLACED.format(", ".join(missing))] if missing else []
-    cameras = {name: msgspec.structs.replace(photos[name].camera, focal=registered[name].focal) for name in registered}
-    outlines = [
-        Outline(name, photos[name].objects.astype(np.int8), cameras[name], pose=each.pose)
-        for name, each in registered.items()
-    ]
-    return Cameras({"sfm": True}, notes=notes, left_out=missing), outlines
+    files = [folder / "transforms.json"]
+    return Cameras({"transforms": "cameras/transforms.json"}, folder, files, notes=notes, left_out=missing)
 
 
 def outlined_shape(views: Mapping[str, View], report: Report) -> Cameras:
@@ -422,52 +439,79 @@ def mask_within(
     return mask, doubt
 
 
-def label_parts(
-    outlines: list[Outline], paths: Mapping[str, Path], folder: Path, report: Callable[[float], None]
-) -> list[str]:
-    """Write the labels of parts by colour into the masks, and return what to look at, in words.
-
-    Labels of a photo without a camera are unknown, so that parts are proposed only if all photos have one.
+class SeenSurface:
+    """Surface of the hull as photos show it: their lights, and parts by colour.
 
     Args:
         outlines: outlines by known cameras
         paths: path of each photo with a foreground
-        folder: the folder of the masks, as `read_views` writes it
-        report: called with the completed share
+
+    Attributes:
+        observed: patches of the hull with their radiance in at most `MOST_VIEWS` photos; None if they share none
     """
 
-    def read(name: str) -> Float[np.ndarray, "h w 3"]:
+    def __init__(self, outlines: list[Outline], paths: Mapping[str, Path]):
+        self.outlines = outlines
+        self.paths = paths
+        self.observed: PatchObservations | None = None
+        with suppress(InputError):
+            self.observed = observe_patches(outlines[:: -(-len(outlines) // MOST_VIEWS)], self.read)
+
+    def read(self, name: str) -> Float[np.ndarray, "h w 3"]:
         """Return the linear radiance of a photo, averaged down as its outline; NaN where it is clipped."""
-        opened = open_photo(paths[name], "PHOTOS")
-        photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), paths[name])
+        opened = open_photo(self.paths[name], "PHOTOS")
+        photo = decode_photo(opened, None, least_factor(opened.height * opened.width, MOST_PIXELS), self.paths[name])
         return np.where(photo.clipped.any(2, keepdims=True), np.nan, photo.radiance)
 
-    if lost := sorted(set(paths) - {outline.photo for outline in outlines}):
-        return [f"parts by colour are not proposed, because photos have no camera: {', '.join(lost)}"]
-    report(0.0)
-    step = -(-len(outlines) // MOST_VIEWS)
-    try:
-        surface = find_parts(outlines[::step], read, lambda share: report(share / 2))
-    except InputError as fault:
-        return [f"parts by colour are not proposed: {fault.fault}"]
-    if len(surface.shares) == 1:
-        return []
-    for k, outline in enumerate(outlines):
-        report((1 + k / len(outlines)) / 2)
-        file = folder / "masks" / f"{outline.photo}.png"
-        mask = read_inside(file, "PHOTOS")
-        labels = surface.label(outline, read(outline.photo))
-        # the nearest label where the mask of the file is larger, at the size of the file
-        nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
-        rows, columns = (np.arange(n) * m // n for n, m in zip(mask.shape, labels.shape, strict=True))
-        labels = labels[tuple(nearest)][rows][:, columns]
-        write_png(file, np.where(mask, labels, 0)[..., None].astype(np.uint8))
-    shares = ", ".join(f"label_{k} {share:.0%}" for k, share in enumerate(surface.shares, start=1))
-    return [
-        f"{len(surface.shares)} parts by colour are proposed as materials ({shares} of the surface): look at the "
-        "contact sheet and give them names in dataset.yaml, two that are one material the same name; WHOLE=1 takes the "
-        "thing for one material"
-    ]
+    def with_lights(self, cameras: Cameras) -> Cameras:
+        """Return the source of cameras with the illumination of each photo, and the reason among its notes."""
+        if self.observed is None or len(self.outlines) < LEAST_VIEWS:
+            kind: Kind = "world"
+            note = ASSUMED_LIGHT
+        else:
+            radiance = self.observed.log_radiance.mean(2)
+            kind, spread = kind_of_light(radiance, self.observed.patches.normal, self.observed.rotations)
+            note = LIGHT_NOTES[kind].format(spread)
+        shared = {} if kind == "photo" else {"illumination": "room"}
+        return msgspec.structs.replace(
+            cameras,
+            source=cameras.source | ({} if kind == "camera" else {"world_from_camera": True}),
+            by_photo={name: shared | further for name, further in cameras.by_photo.items()},
+            notes=[*cameras.notes, note],
+        )
+
+    def label_parts(self, folder: Path, report: Callable[[float], None]) -> list[str]:
+        """Write the labels of parts by colour into the masks, and return what to look at, in words.
+
+        Labels of a photo without a camera are unknown, so that parts are proposed only if all photos have one.
+
+        Args:
+            folder: the folder of the masks, as `read_views` writes it
+            report: called with the completed share
+        """
+        if lost := sorted(set(self.paths) - {outline.photo for outline in self.outlines}):
+            return [f"parts by colour are not proposed, because photos have no camera: {', '.join(lost)}"]
+        if self.observed is None:
+            return ["parts by colour are not proposed: no two photos show the same surface"]
+        surface = find_parts(self.observed, lambda share: report(share / 2))
+        if len(surface.shares) == 1:
+            return []
+        for k, outline in enumerate(self.outlines):
+            report((1 + k / len(self.outlines)) / 2)
+            file = folder / "masks" / f"{outline.photo}.png"
+            mask = read_inside(file, "PHOTOS")
+            labels = surface.label(outline, self.read(outline.photo))
+            # the nearest label where the mask of the file is larger, at the size of the file
+            nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+            rows, columns = (np.arange(n) * m // n for n, m in zip(mask.shape, labels.shape, strict=True))
+            labels = labels[tuple(nearest)][rows][:, columns]
+            write_png(file, np.where(mask, labels, 0)[..., None].astype(np.uint8))
+        shares = ", ".join(f"label_{k} {share:.0%}" for k, share in enumerate(surface.shares, start=1))
+        return [
+            f"{len(surface.shares)} parts by colour are proposed as materials ({shares} of the surface): look at the "
+            "contact sheet and give them names in dataset.yaml, two that are one material the same name; WHOLE=1 takes "
+            "the thing for one material"
+        ]
 
 
 def agreements_of(outlines: list[Outline]) -> dict[str, float]:

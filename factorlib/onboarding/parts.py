@@ -75,6 +75,7 @@ class Patches:
         surface: Hull, at which rays are cast.
         number: Number of the patch of each face.
         area: Area of each patch.
+        normal: Normal of each patch.
         transport: T of (1).
         borders: Length of the border between two patches, in edges.
     """
@@ -88,7 +89,7 @@ class Patches:
         self.number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
         self.area = np.bincount(self.number, size)
         place, axis = (self._mean(each, size) for each in (centre, self.surface.normal))
-        axis = unit(axis)
+        self.normal = axis = unit(axis)
         # T of (1) at places just outside the hull
         points = SurfacePoints(place + LIFT * extent * axis, axis, np.ones(len(place), bool))
         directions = fibonacci_sphere(DIRECTIONS)
@@ -129,6 +130,20 @@ class Patches:
         logs = np.log(radiance[rows[frontal], columns[frontal]])
         sums = np.column_stack([np.bincount(patch, column, len(self.area)) for column in logs.T])
         return np.where(pixels >= LEAST_PIXELS, sums / np.maximum(pixels, 1), np.nan)
+
+
+class PatchObservations(msgspec.Struct, frozen=True):
+    """Patches of a hull, and what photos show of them.
+
+    Attributes:
+        patches: Patches of the hull.
+        rotations: Rotation cam_from_world of each photo.
+        log_radiance: Mean log radiance of each patch in each photo; NaN where the photo does not show it.
+    """
+
+    patches: Patches
+    rotations: Float[np.ndarray, "v 3 3"]
+    log_radiance: Float[np.ndarray, "v p 3"]
 
 
 class Parts(msgspec.Struct, frozen=True):
@@ -213,25 +228,35 @@ class ColouredSurface(msgspec.Struct, frozen=True):
         return np.where(mask, label, 0)
 
 
-def find_parts(
-    outlines: Sequence[Outline], read: Callable[[str], Float[np.ndarray, "h w 3"]], report: Report = lambda share: None
-) -> ColouredSurface:
-    """Return the surface of a thing with its parts by colour, at most `MOST_PARTS`, or one.
+def observe_patches(
+    outlines: Sequence[Outline], read: Callable[[str], Float[np.ndarray, "h w 3"]]
+) -> PatchObservations:
+    """Return the patches of the outlines' hull, and their radiance in the photos.
 
     Args:
         outlines: Masks with cameras and poses.
         read: Function that returns the linear radiance of a photo, by its name; NaN where it is clipped.
-        report: Called with the completed share.
 
     Raises:
         InputError: If there are fewer than two outlines, nothing fits into all of them, or photos share no surface.
     """
     patches = Patches(visual_hull(outlines, HULL_CELLS))
-    log_radiance = at_one_exposure(np.array([patches.observe(each, read(each.photo)) for each in outlines]))
-    log_radiance[patches.transport.sum(1) < LEAST_TRANSPORT] = np.nan
-    if is_observed(log_radiance).sum() <= MOST_PARTS:
+    observed = np.array([patches.observe(each, read(each.photo)) for each in outlines])
+    observed[:, patches.transport.sum(1) < LEAST_TRANSPORT] = np.nan
+    if (np.isfinite(observed).all(2).sum(0) > 1).sum() <= MOST_PARTS:
         raise InputError("no two photos show the same surface", cure="take photos 10 to 20° from each other")
-    return ColouredSurface(patches, log_radiance, select_parts(patches, log_radiance, report))
+    return PatchObservations(patches, np.array([each.known_pose.rotation for each in outlines]), observed)
+
+
+def find_parts(observed: PatchObservations, report: Report = lambda share: None) -> ColouredSurface:
+    """Return the surface of a thing with its parts by colour, at most `MOST_PARTS`, or one.
+
+    Args:
+        observed: Patches of its hull, and what photos show of them.
+        report: Called with the completed share.
+    """
+    log_radiance = at_one_exposure(observed.log_radiance)
+    return ColouredSurface(observed.patches, log_radiance, select_parts(observed.patches, log_radiance, report))
 
 
 def at_one_exposure(observed: Float[np.ndarray, "v p 3"]) -> Float[np.ndarray, "p 3"]:

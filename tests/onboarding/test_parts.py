@@ -11,7 +11,7 @@ from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.onboarding import parts
-from factorlib.onboarding.parts import find_parts
+from factorlib.onboarding.parts import find_parts, observe_patches
 from factorlib.scenes.bodies import photographed_mesh
 from factorlib.shapes.outline import Outline
 from tests.shapes.outlines import looking_from
@@ -78,7 +78,7 @@ def test_materials_in_a_sun_are_found_whatever_the_exposures(lit, exposed):
     truth = regions(3)
     exposures = np.exp(exposed * np.random.default_rng(1).normal(size=(len(outlines), 3)))
     read = partial(photo, radiance=light * COLOURS[truth], faces=faces, exposures=exposures)
-    surface = find_parts(outlines, read)
+    surface = find_parts(observe_patches(outlines, read))
     assert len(surface.shares) == 3 and list(surface.shares) == sorted(surface.shares, reverse=True)
     assert np.sqrt(np.diag(surface.parts.covariance)).max() < 0.26  # 0.23 at one exposure
     for k in (0, 4, 7):
@@ -92,11 +92,11 @@ def test_materials_in_a_sun_are_found_whatever_the_exposures(lit, exposed):
 
 
 def test_photos_with_fewer_colours_than_parts_are_no_error(lit):
-    surface = find_parts(lit[0], lambda name: np.full((CAMERA.height, CAMERA.width, 3), 0.2))
+    surface = find_parts(observe_patches(lit[0], lambda name: np.full((CAMERA.height, CAMERA.width, 3), 0.2)))
     assert surface.shares.sum() == pytest.approx(1)
 
 
 def test_a_plain_solid_in_a_sun_is_one_part(lit):
     outlines, faces, light = lit
     read = partial(photo, radiance=0.6 * light, faces=faces, exposures=np.ones((len(outlines), 1)))
-    assert len(find_parts(outlines, read).shares) == 1
+    assert len(find_parts(observe_patches(outlines, read)).shares) == 1
