@@ -34,6 +34,7 @@ SMOOTHED_AWAY = 0.004  # overlap (IoU) that smoothing may cost
 SLAB = 1 << 18  # number of points evaluated at once
 LEAST_Z = 1e-6  # least depth in front of a camera
 SAMPLES = 40  # of `agreement` and `hull_box`: pixels a side, and depths of each pixel's ray
+OTHERS = 24  # most outlines that one is compared with in `agreements`
 MARGIN = 1.2  # extent of the examined part of a photo, in those of its outline
 FOCALS = (0.7, 5.0)  # range of `focal_by_hull`, in units of the photo's longer side
 TRIALS = 16  # most focal lengths that are tried
@@ -221,13 +222,16 @@ def signed_distance(outlines: Sequence[Outline], points: Points, dissenting: int
 
 
 def agreements(outlines: Sequence[Outline]) -> list[float]:
-    """Return the agreement of each outline with the others, of which a third may be wrong.  All need poses.
+    """Return the agreement of each outline with others, of which a third may be wrong.  All need poses.
+
+    The others are all, or where there are more than `OTHERS`, so many of them, evenly by their order.
 
     Raises:
         InputError: All photos see the object from the same side, or one has it behind its camera.
     """
-    dissenting = (len(outlines) - 1) // 3
-    return [agreement(outline, [*outlines[:k], *outlines[k + 1 :]], dissenting) for k, outline in enumerate(outlines)]
+    step = -(-(len(outlines) - 1) // OTHERS)
+    others = ([*outlines[k + 1 :], *outlines[:k]][::step] for k in range(len(outlines)))
+    return [agreement(outline, each, len(each) // 3) for outline, each in zip(outlines, others)]
 
 
 def agreement(outline: Outline, others: Sequence[Outline], dissenting: int = 0) -> float:
