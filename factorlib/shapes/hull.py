@@ -229,7 +229,7 @@ def agreements(outlines: Sequence[Outline]) -> list[float]:
     Raises:
         InputError: All photos see the object from the same side, or one has it behind its camera.
     """
-    step = -(-(len(outlines) - 1) // OTHERS)
+    step = max(-(-(len(outlines) - 1) // OTHERS), 1)
     others = ([*outlines[k + 1 :], *outlines[:k]][::step] for k in range(len(outlines)))
     return [agreement(outline, each, len(each) // 3) for outline, each in zip(outlines, others)]
 
