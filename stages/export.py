@@ -37,7 +37,7 @@ from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge, write_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
-from factorlib.inference.aligned_photo import read_aligned_photos
+from factorlib.inference.surface.aligned_photo import read_aligned_photos
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes

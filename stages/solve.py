@@ -20,24 +20,11 @@ from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.inference import options
-from factorlib.inference.answer import Answer
-from factorlib.inference.blocks import Block, Noise
-from factorlib.inference.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
-from factorlib.inference.held_out_photos import fit_lights_given_materials, predicted_exposures
-from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
-from factorlib.inference.joint_solver import solve
-from factorlib.inference.known import extract_known
-from factorlib.inference.observed import (
-    blocks_of_observations,
-    gather_observations,
-    read_backgrounds,
-    read_grounds,
-    usable_observations,
-)
-from factorlib.inference.paper_solver import REPORTS, PaperOptions, Prior, Samplings
-from factorlib.inference.paper_solver import solve_paper as solve_as_the_paper
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import (
+from factorlib.inference.answer.answer import Answer
+from factorlib.inference.answer.identifiability import after_solving, before_solving, unusable_observations
+from factorlib.inference.answer.uncertainty import estimate_uncertainty
+from factorlib.inference.fit.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
+from factorlib.inference.fit.start import (
     InitialFit,
     Start,
     start_from_earlier,
@@ -45,7 +32,20 @@ from factorlib.inference.start import (
     start_from_surface,
     with_earlier_decisions,
 )
-from factorlib.inference.uncertainty import estimate_uncertainty
+from factorlib.inference.held_out_photos import fit_lights_given_materials, predicted_exposures
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.model.blocks import Block, Noise
+from factorlib.inference.model.known import extract_known
+from factorlib.inference.model.observed import (
+    blocks_of_observations,
+    gather_observations,
+    read_backgrounds,
+    read_grounds,
+    usable_observations,
+)
+from factorlib.inference.model.problem import JointProblem
+from factorlib.inference.paper_solver import REPORTS, PaperOptions, Prior, Samplings
+from factorlib.inference.paper_solver import solve_paper as solve_as_the_paper
 from factorlib.jsonfile import read_result, write_json
 from factorlib.light.lobes import Lobes
 from factorlib.parquetfile import write_rows

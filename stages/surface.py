@@ -1,11 +1,11 @@
 """Surface detail by shading: normals and albedo factors that differ from the meshes as given, from all photos together.
 
 Materials and lights are fitted as at the start of the solve.  Normals then turn to explain all photos best, and the
-turns are kept only if they improve held-out photos (`factorlib.inference.surface_detail`).  Factors on the diffuse
-reflectance are chosen likewise, in addition to the turns.
+turns are kept only if they improve held-out photos (`factorlib.inference.surface.surface_detail`).  Factors on the
+diffuse reflectance are chosen likewise, in addition to the turns.
 
 Where photos show more lights than `Params.lights`, the ones that tell most of the materials are selected here, for
-`solve` as well (`factorlib.inference.light_selection`).
+`solve` as well (`factorlib.inference.surface.light_selection`).
 
 Writes surface.json, and beginning.json: materials and lights of the first fit, from which `solve` continues.  If
 surfaces differ, it writes photos/<photo>.exr: normals, which later stages use instead of those of `align`, and factors.
@@ -21,14 +21,14 @@ import numpy as np
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, solved_photos
 from factorlib.errors import InputError
 from factorlib.images.exr import write_exr
-from factorlib.inference.aligned_photo import AlignedPhoto, read_aligned_photos, visible_meshes
-from factorlib.inference.blocks import Noise
-from factorlib.inference.light_selection import Counts, count_by_side, select_lights
-from factorlib.inference.observed import blocks_of_observations, read_backgrounds, usable_observations
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import start_from_photos
-from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
-from factorlib.inference.surface_turns import (
+from factorlib.inference.fit.start import start_from_photos
+from factorlib.inference.model.blocks import Noise
+from factorlib.inference.model.observed import blocks_of_observations, read_backgrounds, usable_observations
+from factorlib.inference.model.problem import JointProblem
+from factorlib.inference.surface.aligned_photo import AlignedPhoto, read_aligned_photos, visible_meshes
+from factorlib.inference.surface.light_selection import Counts, count_by_side, select_lights
+from factorlib.inference.surface.surface_detail import SurfaceEstimate, estimate_surface
+from factorlib.inference.surface.surface_turns import (
     SurfacePositions,
     Surfaces,
     concatenate_positions,

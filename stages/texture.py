@@ -1,7 +1,7 @@
 """Albedo textures: the paint of each material on each mesh, from all photos, in the lights that `solve` estimated.
 
 Every pixel observes the factor of its surface point on the diffuse reflectance, once light and specular part are known
-(`factorlib.inference.texture`).  A texture is kept if it predicts photos that it was not estimated from.
+(`factorlib.inference.surface.texture`).  A texture is kept if it predicts photos that it was not estimated from.
 
 Writes texture.json, and if a texture is kept, factors.parquet and photos/<photo>.exr: the factors at every pixel.
 """
@@ -19,9 +19,9 @@ from scipy.sparse import csr_array
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, solved_photos
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.tone import invert_tone
-from factorlib.inference.aligned_photo import AlignedPhoto, pixel_on_mesh, read_aligned_photos, visible_meshes
-from factorlib.inference.surface_turns import Surfaces
-from factorlib.inference.texture import STIFFNESSES, TextureSamples, observe_texture, select_texture
+from factorlib.inference.surface.aligned_photo import AlignedPhoto, pixel_on_mesh, read_aligned_photos, visible_meshes
+from factorlib.inference.surface.surface_turns import Surfaces
+from factorlib.inference.surface.texture import STIFFNESSES, TextureSamples, observe_texture, select_texture
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache

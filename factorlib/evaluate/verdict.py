@@ -7,7 +7,7 @@ score (`factorlib.evaluate.relighting`), is
 
 m²  squared change of a ball per standard error of each reflectance and of roughness, summed over these, mean over balls
 c   share of values that are clipped, mean over photos
-u   share of the shading that is not explained (`factorlib.inference.misfit`)
+u   share of the shading that is not explained (`factorlib.inference.model.misfit`)
 d   distance between the outlines of meshes and masks (`contour_error` of poses.json), mean over objects
 
 and −10 log₁₀ e² is the expected score in dB.  Where no shading is explained, u = 1, a result is worth a flat colour,
@@ -26,8 +26,8 @@ from factorlib.evaluate.ball import OctahedralLight
 from factorlib.evaluate.picture_errors import tone_map
 from factorlib.evaluate.predicted_views import describe_views
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
-from factorlib.inference.identifiability import helpful_light
-from factorlib.inference.materials import ROUGHNESS
+from factorlib.inference.answer.identifiability import helpful_light
+from factorlib.inference.model.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, SolvedMaterial
 from factorlib.results.metrics import Trust, Verdict
 

@@ -10,7 +10,7 @@ from factorlib.export.exported_scene import ExportedShape
 from factorlib.export.mitsuba import paint_range
 from factorlib.export.texture_atlas import UNKNOWN_PIXEL, Atlas, make_atlas
 from factorlib.images.picture import write_png
-from factorlib.inference.aligned_photo import AlignedPhoto, pixel_on_mesh
+from factorlib.inference.surface.aligned_photo import AlignedPhoto, pixel_on_mesh
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read_mesh import MeshCache

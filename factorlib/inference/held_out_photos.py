@@ -1,7 +1,7 @@
 """Lights and exposures of photos that take no part in a solve, given its materials.
 
-These are held-out photos, and those of lights that were not selected (`factorlib.inference.light_selection`).  The
-latter have their lights fitted.
+These are held-out photos, and those of lights that were not selected (`factorlib.inference.surface.light_selection`).
+The latter have their lights fitted.
 
 A held-out photo is predicted.  If solved photos share its light, it has that light.
 Its exposure relative to them is that of EXIF or `known` where both have one, and else 1.  Otherwise its
@@ -16,14 +16,14 @@ import msgspec
 import numpy as np
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.inference.fit import FitSchedule, initial_fit
-from factorlib.inference.fit_runner import FitRunner, Solution, SolveState
+from factorlib.inference.fit.fit import FitSchedule, initial_fit
+from factorlib.inference.fit.fit_runner import FitRunner, Solution, SolveState
+from factorlib.inference.fit.start import constant_light
 from factorlib.inference.joint_solver import CHOICES, FITS, SolveRequest
-from factorlib.inference.known import KnownValues
-from factorlib.inference.materials import Point
+from factorlib.inference.model.known import KnownValues
+from factorlib.inference.model.materials import Point
+from factorlib.inference.model.problem import JointProblem
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import constant_light
 from factorlib.light.lobes import Lobes
 from factorlib.results.materials import Channels, vec3
 from factorlib.urm.observations import Observations

@@ -1,24 +1,25 @@
 """Joint solve: one reflectance per material and one light per illumination, from all photos at once.
 
 effects     Held-out observations choose shadows, and marginal likelihoods interreflection
-            (`factorlib.inference.model_selection`).
+            (`factorlib.inference.choices.model_selection`).
 background  Marginal likelihoods choose the lights whose prior also uses the surroundings that photos show
-            (`factorlib.inference.background`).
+            (`factorlib.inference.model.background`).
 tone        Held-out observations choose tone curves.
 distances   Marginal likelihoods choose distances of lights.
 ground      Shadows on the ground are observations of a light too, where they lie as the objects say.  They are modelled
             as those of an infinitely distant light, so they do not choose distances.
 materials   The 24 cells with most of a light's energy split in about four while the log Bayes factor for that is very
-            strong (`factorlib.inference.splitting`).  In a light blurred by large cells, materials come out too smooth.
-            Then materials and lights are fitted together to observations with reliable normals
-            (`factorlib.inference.fit`).  From here on held-out observations are fitted too: left out, they would leave
-            holes in the lights.
+            strong (`factorlib.inference.choices.splitting`).  In a light blurred by large cells, materials come out too
+            smooth.  Then materials and lights are fitted together to observations with reliable normals
+            (`factorlib.inference.fit.fit`).  From here on held-out observations are fitted too: left out, they would
+            leave holes in the lights.
 prior       Each material is estimated again under the prior on materials, with the errors of the model in its
-            covariance (`factorlib.inference.material_posterior`).
+            covariance (`factorlib.inference.answer.material_posterior`).
 lights      Given the materials, lights are fitted to observations of any confidence.
-suns        Each light is compared with one that has a sun in place of its brightest cells (`factorlib.inference.suns`).
+suns        Each light is compared with one that has a sun in place of its brightest cells
+            (`factorlib.inference.choices.suns`).
 
-Every step is a function of the previous state, and `FitRunner` saves each state (`factorlib.inference.fit_runner`).
+Every step is a function of the previous state, and `FitRunner` saves each state (`factorlib.inference.fit.fit_runner`).
 """
 
 from __future__ import annotations
@@ -27,11 +28,8 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from factorlib.inference.fit import LIGHT_TEMPERATURE, Fit, FitSchedule, reliable_observations
-from factorlib.inference.fit_runner import FitRunner, Solution, SolveState
-from factorlib.inference.gauge import fix_gauge
-from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import (
+from factorlib.inference.answer.uncertainty import Posterior
+from factorlib.inference.choices.model_selection import (
     TRIAL_CELLS,
     select_backgrounds,
     select_distances,
@@ -39,13 +37,16 @@ from factorlib.inference.model_selection import (
     select_grounds,
     select_tone_curves,
 )
-from factorlib.inference.normal_errors import normal_errors, with_normal_errors
+from factorlib.inference.choices.splitting import split_cells
+from factorlib.inference.choices.suns import select_suns
+from factorlib.inference.fit.fit import LIGHT_TEMPERATURE, Fit, FitSchedule, reliable_observations
+from factorlib.inference.fit.fit_runner import FitRunner, Solution, SolveState
+from factorlib.inference.fit.start import Start, insert_known, refine_cells
+from factorlib.inference.model.gauge import fix_gauge
+from factorlib.inference.model.materials import Point
+from factorlib.inference.model.normal_errors import normal_errors, with_normal_errors
+from factorlib.inference.model.problem import JointProblem
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.splitting import split_cells
-from factorlib.inference.start import Start, insert_known, refine_cells
-from factorlib.inference.suns import select_suns
-from factorlib.inference.uncertainty import Posterior
 from factorlib.results.materials import Decision, Model
 
 REFINED = FitSchedule(light_steps=2, descents=(0,), materials_fixed=True)
@@ -97,7 +98,7 @@ def solve(
     run: FitRunner | None = None,
     decided: Model | None = None,
 ) -> Solution:
-    """Solve the problem and return the answer, in the gauge of `factorlib.inference.gauge`.
+    """Solve the problem and return the answer, in the gauge of `factorlib.inference.model.gauge`.
 
     Args:
         problem: Observations and model.

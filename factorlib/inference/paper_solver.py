@@ -2,8 +2,8 @@
 
     minimise  mean over observations and channels of (y − radiance)² / σ²  +  β · mean over lights of Var_c(W_c) / W̄²
 
-y is the prediction of `factorlib.inference.forward`, σ its noise model, W_c the summed lobe weights of channel c, and
-W̄ their mean.  Wang, Ritschel and Mitra state: L-BFGS; another random subset at every iteration; each observation
+y is the prediction of `factorlib.inference.model.forward`, σ its noise model, W_c the summed lobe weights of channel c,
+and W̄ their mean.  Wang, Ritschel and Mitra state: L-BFGS; another random subset at every iteration; each observation
 sampled 5 times on average; n_p = 32 lobes an illumination; β = 0.1.  This solver is the baseline of every comparison.
 
 The paper leaves the following open, as far as it is known here:
@@ -41,15 +41,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.fit import initial_fit
-from factorlib.inference.fit_runner import Event, EventReport, Solution, ignore_event
-from factorlib.inference.gauge import fix_gauge
-from factorlib.inference.lights import Light
-from factorlib.inference.materials import ROUGHNESS, SHARPNESS, UNKNOWNS, Materials, Point
-from factorlib.inference.optimizer import inverse_hessian_times
+from factorlib.inference.fit.fit import initial_fit
+from factorlib.inference.fit.fit_runner import Event, EventReport, Solution, ignore_event
+from factorlib.inference.fit.optimizer import inverse_hessian_times
+from factorlib.inference.fit.start import starting_materials
+from factorlib.inference.model.gauge import fix_gauge
+from factorlib.inference.model.lights import Light
+from factorlib.inference.model.materials import ROUGHNESS, SHARPNESS, UNKNOWNS, Materials, Point
+from factorlib.inference.model.problem import JointProblem
 from factorlib.inference.options import Lobes, Seed, SolveOptions
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import starting_materials
 from factorlib.light.prior import read_light_prior
 from factorlib.reflection.operator import Operator
 
@@ -88,7 +88,7 @@ class PaperOptions(msgspec.Struct, frozen=True):
 def solve_paper(
     problem: JointProblem, materials: int, options: PaperOptions, report: EventReport = ignore_event
 ) -> Solution:
-    """Solve the problem as the paper does, in the gauge of `factorlib.inference.gauge`.
+    """Solve the problem as the paper does, in the gauge of `factorlib.inference.model.gauge`.
 
     The unknowns are those of the joint solver: materials 0 … `materials`−1 and one light per block.
 

@@ -27,7 +27,7 @@ from factorlib.conventions import FRONT
 from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.tone import apply_tone
-from factorlib.inference.interreflection import bounced_light
+from factorlib.inference.model.interreflection import bounced_light
 from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.lobes import Lobes, lobe_energy
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share, widened_sharpness
@@ -173,7 +173,7 @@ class Surroundings(msgspec.Struct, frozen=True):
 
     Attributes:
         observations: the observations, with their visibility
-        bounced: G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture; None is zero
+        bounced: G_d and G_s of `factorlib.inference.model.interreflection`, in the unit of the picture; None is zero
     """
 
     observations: Observations

@@ -12,7 +12,7 @@ from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import data_uri, read_png
-from factorlib.inference.suns import LEAST_SUN_SHARE
+from factorlib.inference.choices.suns import LEAST_SUN_SHARE
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
 from factorlib.report.template import headlines, render_template, sentences

@@ -249,7 +249,7 @@ class Misfit(msgspec.Struct, frozen=True):
     """Shares of a photo that the solution leaves unexplained, and that are clipped.
 
     Attributes:
-        unexplained: share of the photo's shading that is not explained (`factorlib.inference.misfit`)
+        unexplained: share of the photo's shading that is not explained (`factorlib.inference.model.misfit`)
         clipped: share of the photo's values that are clipped
     """
 

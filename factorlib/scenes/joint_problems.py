@@ -10,10 +10,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from factorlib.inference.blocks import Block
-from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import Light
-from factorlib.inference.materials import Materials
+from factorlib.inference.model.blocks import Block
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.lights import Light
+from factorlib.inference.model.materials import Materials
 from factorlib.reflection import Operator
 from factorlib.urm.observations import Observations
 

@@ -8,7 +8,7 @@ plane through f with normal n below the objects, the pixel's ray d meets
 
 So a photo that looks down on an object shows most of the light that reaches it from below.  Photos are not proofs: a
 backdrop may hide the lamps, and a cut-out has no surroundings at all.  A solve therefore leaves out a
-background that the observations of the objects contradict (`factorlib.inference.model_selection`).
+background that the observations of the objects contradict (`factorlib.inference.choices.model_selection`).
 """
 
 from collections.abc import Mapping

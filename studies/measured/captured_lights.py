@@ -1,6 +1,7 @@
 """Suns and tints of captured lights: `python -m studies.measured.captured_lights FOLDER …`.
 
-`factorlib.inference.suns` tells sunlight by share and warmth, and `factorlib.inference.gauge` weighs mean tints.
+`factorlib.inference.choices.suns` tells sunlight by share and warmth, and `factorlib.inference.model.gauge` weighs mean
+tints.
 """
 
 import sys

@@ -1,6 +1,7 @@
 """Classes of the prior on materials, fitted to a table of measured materials.
 
-`python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]` takes a second.
+`python -m studies.measured.material_classes FILE [--out factorlib/inference/model/material_classes.json]` takes a
+second.
 
 FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and
 `roughness`, and `k_s_r`, `k_s_g`, `k_s_b`, `k_d_r`, `k_d_g` and `k_d_b`, whose ratios are the tints.  The class of a
@@ -18,7 +19,7 @@ import numpy as np
 import typer
 
 from factorlib.errors import InputError
-from factorlib.inference.material_prior import Classes, MaterialClass
+from factorlib.inference.model.material_prior import Classes, MaterialClass
 from factorlib.jsonfile import json_text, write_json
 from factorlib.reading import read_bytes, reading
 

@@ -1,6 +1,6 @@
 """Errors of normals by their confidence, and of poses, where true ones are known.
 
-`python -m studies.measured.normals DATASET …` shows how well `factorlib.inference.normal_errors` states them.
+`python -m studies.measured.normals DATASET …` shows how well `factorlib.inference.model.normal_errors` states them.
 """
 
 import sys
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from factorlib.dataset.read_dataset import read_dataset
 from factorlib.evaluate.truth import pose_error
 from factorlib.images.exr import read_exr
-from factorlib.inference.normal_errors import DEVIATION
+from factorlib.inference.model.normal_errors import DEVIATION
 from factorlib.results.poses import FILE, read_poses
 from factorlib.urm.extract import read_geometry
 from studies.measured.tools import ROOT, machine, markdown_table, run_verb

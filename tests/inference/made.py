@@ -4,11 +4,11 @@ import msgspec
 import numpy as np
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.blocks import Block
-from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import Light
-from factorlib.inference.materials import Point
-from factorlib.inference.problem import JointProblem
+from factorlib.inference.model.blocks import Block
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.lights import Light
+from factorlib.inference.model.materials import Point
+from factorlib.inference.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
 from factorlib.scenes.joint_problems import (

@@ -5,14 +5,14 @@ from functools import cache
 import msgspec
 import numpy as np
 
-from factorlib.inference.blocks import RobustLoss
-from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_problem, initial_fit, light_likelihood
-from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import PEAK, Light, fibonacci_cells
-from factorlib.inference.likelihood import LightLikelihood
-from factorlib.inference.materials import Materials, Point
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import constant_light, rotated_cells
+from factorlib.inference.fit.fit import Fit, FitSchedule, Hyperparameters, fit_problem, initial_fit, light_likelihood
+from factorlib.inference.fit.likelihood import LightLikelihood
+from factorlib.inference.fit.start import constant_light, rotated_cells
+from factorlib.inference.model.blocks import RobustLoss
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.lights import PEAK, Light, fibonacci_cells
+from factorlib.inference.model.materials import Materials, Point
+from factorlib.inference.model.problem import JointProblem
 from factorlib.light.prior import MIX, read_light_prior
 from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import MATERIALS, sphere_block

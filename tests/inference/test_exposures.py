@@ -4,14 +4,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference.exposures import ExposureTerms, balance_exposures, material_groups
-from factorlib.inference.fit import fit_problem
-from factorlib.inference.identifiability import before_solving
-from factorlib.inference.known import KnownValues
-from factorlib.inference.material_prior import MaterialPrior, material_unknowns
-from factorlib.inference.materials import Materials, Point
-from factorlib.inference.optimizer import Descent
-from factorlib.inference.problem import JointProblem
+from factorlib.inference.answer.identifiability import before_solving
+from factorlib.inference.fit.exposures import ExposureTerms, balance_exposures, material_groups
+from factorlib.inference.fit.fit import fit_problem
+from factorlib.inference.fit.optimizer import Descent
+from factorlib.inference.model.known import KnownValues
+from factorlib.inference.model.material_prior import MaterialPrior, material_unknowns
+from factorlib.inference.model.materials import Materials, Point
+from factorlib.inference.model.problem import JointProblem
 from tests.inference.made_lights import (
     MATERIALS,
     OPERATOR,

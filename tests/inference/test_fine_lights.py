@@ -6,17 +6,24 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference import fit as fits
-from factorlib.inference import joint_solver, suns
-from factorlib.inference.fit import FitSchedule, fit_problem
-from factorlib.inference.fit_runner import FitRunner, SolveState
+from factorlib.inference import joint_solver
+from factorlib.inference.choices import suns
+from factorlib.inference.choices.model_selection import CLEARLY_AGAINST, VERY_STRONG
+from factorlib.inference.choices.splitting import SPLIT_CELLS, split_cells
+from factorlib.inference.choices.suns import (
+    WIDE_SHARPNESS,
+    accept_sun,
+    compare_illuminations,
+    replace_brightest,
+    select_suns,
+)
+from factorlib.inference.fit import fit as fits
+from factorlib.inference.fit.fit import FitSchedule, fit_problem
+from factorlib.inference.fit.fit_runner import FitRunner, SolveState
 from factorlib.inference.joint_solver import MATERIALS as JOINTLY
 from factorlib.inference.joint_solver import OBSERVATION_FACTOR, SolveRequest, fit_materials
-from factorlib.inference.lights import UnitLobes
-from factorlib.inference.model_selection import CLEARLY_AGAINST, VERY_STRONG
+from factorlib.inference.model.lights import UnitLobes
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.splitting import SPLIT_CELLS, split_cells
-from factorlib.inference.suns import WIDE_SHARPNESS, accept_sun, compare_illuminations, replace_brightest, select_suns
 from factorlib.light.lobes import SUN, lobe_energy
 from factorlib.results.materials import Decision
 from factorlib.scenes.joint_problems import MATERIALS

@@ -7,8 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from factorlib.images import tone
-from factorlib.inference.blocks import Noise
-from factorlib.inference.fit import (
+from factorlib.inference.fit.fit import (
     DARK_NOISE,
     LIGHT_TEMPERATURE,
     Fit,
@@ -18,15 +17,21 @@ from factorlib.inference.fit import (
     initial_fit,
     reliable_observations,
 )
+from factorlib.inference.fit.likelihood import cholesky_factor
+from factorlib.inference.fit.optimizer import Arrow, Descent, descend_light, determinant_terms
+from factorlib.inference.fit.start import constant_light
 from factorlib.inference.joint_solver import LIGHTS
-from factorlib.inference.lights import TONE_RANGE, Light
-from factorlib.inference.likelihood import cholesky_factor
-from factorlib.inference.material_prior import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS, MaterialPrior, material_unknowns
-from factorlib.inference.materials import Materials, Point
-from factorlib.inference.optimizer import Arrow, Descent, descend_light, determinant_terms
+from factorlib.inference.model.blocks import Noise
+from factorlib.inference.model.lights import TONE_RANGE, Light
+from factorlib.inference.model.material_prior import (
+    BRIGHTNESS_DEVIATION,
+    MEDIAN_BRIGHTNESS,
+    MaterialPrior,
+    material_unknowns,
+)
+from factorlib.inference.model.materials import Materials, Point
+from factorlib.inference.model.problem import JointProblem
 from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve_paper
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import constant_light
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import FitStatus
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block

@@ -11,20 +11,24 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference.blocks import Noise
-from factorlib.inference.fit import Fit, initial_fit
-from factorlib.inference.fit_runner import Solution
-from factorlib.inference.forward import Illumination
-from factorlib.inference.gauge import connected_components
-from factorlib.inference.identifiability import poorly_explained, undetermined_by_answer, undetermined_by_observations
+from factorlib.inference.answer.identifiability import (
+    poorly_explained,
+    undetermined_by_answer,
+    undetermined_by_observations,
+)
+from factorlib.inference.answer.uncertainty import estimate_uncertainty
+from factorlib.inference.fit.fit import Fit, initial_fit
+from factorlib.inference.fit.fit_runner import Solution
+from factorlib.inference.fit.start import BRIGHTEST_AT_START, constant_light, mean_albedo, start_from_photos
 from factorlib.inference.joint_solver import solve
-from factorlib.inference.lights import Light
-from factorlib.inference.materials import Materials, Point
-from factorlib.inference.observed import blocks_of_observations
+from factorlib.inference.model.blocks import Noise
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.gauge import connected_components
+from factorlib.inference.model.lights import Light
+from factorlib.inference.model.materials import Materials, Point
+from factorlib.inference.model.observed import blocks_of_observations
+from factorlib.inference.model.problem import JointProblem
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import BRIGHTEST_AT_START, constant_light, mean_albedo, start_from_photos
-from factorlib.inference.uncertainty import estimate_uncertainty
 from factorlib.jsonfile import read_json
 from factorlib.scenes.joint_problems import sphere_normals
 from factorlib.urm.observations import Observations

@@ -7,24 +7,24 @@ import pytest
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
-from factorlib.inference import optimizer
-from factorlib.inference.fit import FitSchedule, fit_problem, initial_fit
-from factorlib.inference.gauge import BRIGHTEST, fix_gauge
-from factorlib.inference.identifiability import tinted_alike
-from factorlib.inference.known import KnownValues, light_from_ball, light_from_map
-from factorlib.inference.lights import Light
-from factorlib.inference.material_prior import MaterialPrior, PriorTerms, material_unknowns
-from factorlib.inference.materials import LEAST_REFLECTANCE, Point
-from factorlib.inference.misfit import unexplained_shares
-from factorlib.inference.optimizer import Descent, step_light
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import insert_known
-from factorlib.inference.uncertainty import (
+from factorlib.inference.answer.identifiability import tinted_alike
+from factorlib.inference.answer.uncertainty import (
     LARGEST_RELATIVE_ERROR,
     WIDTHS,
     Posterior,
     project_to_gauge,
 )
+from factorlib.inference.fit import optimizer
+from factorlib.inference.fit.fit import FitSchedule, fit_problem, initial_fit
+from factorlib.inference.fit.optimizer import Descent, step_light
+from factorlib.inference.fit.start import insert_known
+from factorlib.inference.model.gauge import BRIGHTEST, fix_gauge
+from factorlib.inference.model.known import KnownValues, light_from_ball, light_from_map
+from factorlib.inference.model.lights import Light
+from factorlib.inference.model.material_prior import MaterialPrior, PriorTerms, material_unknowns
+from factorlib.inference.model.materials import LEAST_REFLECTANCE, Point
+from factorlib.inference.model.misfit import unexplained_shares
+from factorlib.inference.model.problem import JointProblem
 from factorlib.light.latlong import map_energy
 from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block, sphere_normals
@@ -205,7 +205,7 @@ def off_lamp(light: Light) -> float:
 
 
 def test_a_map_becomes_a_light_of_its_energy_in_its_directions(monkeypatch):
-    monkeypatch.setattr("factorlib.inference.known.MAP_ROWS", 40)
+    monkeypatch.setattr("factorlib.inference.model.known.MAP_ROWS", 40)
     radiance = lamp((lat_long_directions(40, 80) @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(40, 80, 3)
     light = light_from_map(radiance)
     np.testing.assert_allclose(light.energy.sum(0), map_energy(radiance), rtol=1e-3)

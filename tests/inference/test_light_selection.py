@@ -7,8 +7,8 @@ import numpy as np
 
 from factorlib.dataset.schema import Intrinsics, MeshEntry, MeshInstance, ObjectsSlice
 from factorlib.geometry.camera import rotation_of_vector
-from factorlib.inference.aligned_photo import AlignedPhoto
-from factorlib.inference.light_selection import count_by_side, select_lights
+from factorlib.inference.surface.aligned_photo import AlignedPhoto
+from factorlib.inference.surface.light_selection import count_by_side, select_lights
 from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses
 from tests.inference.made import observations_from_front
 

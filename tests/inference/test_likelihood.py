@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.blocks import RobustLoss
-from factorlib.inference.forward import Illumination
-from factorlib.inference.likelihood import EXPOSURE_DEVIATION, TONE_DEVIATION
-from factorlib.inference.material_prior import (
+from factorlib.inference.fit.likelihood import EXPOSURE_DEVIATION, TONE_DEVIATION
+from factorlib.inference.model.blocks import RobustLoss
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.material_prior import (
     MaterialPrior,
     Mixture,
     likeliest_class,
@@ -18,10 +18,10 @@ from factorlib.inference.material_prior import (
     materials_from_unknowns,
     shipped_classes,
 )
-from factorlib.inference.materials import Materials, Point
-from factorlib.inference.normal_errors import with_normal_errors
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.responses import ResponseTable
+from factorlib.inference.model.materials import Materials, Point
+from factorlib.inference.model.normal_errors import with_normal_errors
+from factorlib.inference.model.problem import JointProblem
+from factorlib.inference.model.responses import ResponseTable
 from factorlib.scenes.joint_problems import MATERIALS, sphere_block
 from tests.inference.made import none_held_out
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, likelihood, on_even_cells, photographed, spheres

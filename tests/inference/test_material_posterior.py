@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from factorlib.inference.material_posterior import BOUNDS, material_posterior
-from factorlib.inference.material_prior import Mixture, shipped_classes
+from factorlib.inference.answer.material_posterior import BOUNDS, material_posterior
+from factorlib.inference.model.material_prior import Mixture, shipped_classes
 
 ENAMEL = np.array([*np.log([0.3, 0.2, 0.1]), *np.log([0.2, 0.2, 0.2]), 0.12])
 ALL = np.ones(7, bool)

@@ -10,17 +10,10 @@ from hypothesis import strategies as st
 
 from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.images.tone import curve
-from factorlib.inference import model_selection, suns
-from factorlib.inference.blocks import FIT_LOSS, Noise
-from factorlib.inference.fit import FitSchedule, reliable_observations
-from factorlib.inference.fit_runner import FitRunner
-from factorlib.inference.forward import Illumination
-from factorlib.inference.gauge import BRIGHTEST
-from factorlib.inference.identifiability import unlikely_curves
-from factorlib.inference.interreflection import bounced_light
-from factorlib.inference.joint_solver import solve
-from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import (
+from factorlib.inference.answer.identifiability import unlikely_curves
+from factorlib.inference.answer.uncertainty import Posterior, estimate_uncertainty
+from factorlib.inference.choices import model_selection, suns
+from factorlib.inference.choices.model_selection import (
     CLEARLY_AGAINST,
     CLEARLY_FOR,
     CURVATURES,
@@ -38,12 +31,19 @@ from factorlib.inference.model_selection import (
     select_tone_curves,
     simultaneous_margin,
 )
-from factorlib.inference.observed import blocks_of_observations
+from factorlib.inference.choices.suns import select_suns
+from factorlib.inference.fit.fit import FitSchedule, reliable_observations
+from factorlib.inference.fit.fit_runner import FitRunner
+from factorlib.inference.fit.start import start_from_photos
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.model.blocks import FIT_LOSS, Noise
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.gauge import BRIGHTEST
+from factorlib.inference.model.interreflection import bounced_light
+from factorlib.inference.model.materials import Point
+from factorlib.inference.model.observed import blocks_of_observations
+from factorlib.inference.model.problem import JointProblem
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import start_from_photos
-from factorlib.inference.suns import select_suns
-from factorlib.inference.uncertainty import Posterior, estimate_uncertainty
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, sphere_normals
 from factorlib.urm.observations import Observations
 from tests.inference.made import bowls, none_held_out, rough_light

@@ -4,15 +4,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference.blocks import Noise
-from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_problem
-from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import Light
-from factorlib.inference.materials import Materials, Point
-from factorlib.inference.normal_errors import DEVIATION, POSE_DEVIATION, normal_errors, with_normal_errors
-from factorlib.inference.observed import blocks_of_observations
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.uncertainty import Posterior
+from factorlib.inference.answer.uncertainty import Posterior
+from factorlib.inference.fit.fit import Fit, FitSchedule, Hyperparameters, fit_problem
+from factorlib.inference.model.blocks import Noise
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.lights import Light
+from factorlib.inference.model.materials import Materials, Point
+from factorlib.inference.model.normal_errors import DEVIATION, POSE_DEVIATION, normal_errors, with_normal_errors
+from factorlib.inference.model.observed import blocks_of_observations
+from factorlib.inference.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import (
     MATERIALS,

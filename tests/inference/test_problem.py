@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
-from factorlib.inference.blocks import Noise
-from factorlib.inference.forward import Illumination
-from factorlib.inference.gauge import (
+from factorlib.inference.choices.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
+from factorlib.inference.model.blocks import Noise
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.gauge import (
     BOUNCE_DEVIATION,
     BRIGHTEST,
     BRIGHTNESS_DEVIATION,
@@ -16,12 +17,11 @@ from factorlib.inference.gauge import (
     connected_components,
     fix_gauge,
 )
-from factorlib.inference.interreflection import bounced_light
-from factorlib.inference.lights import Light, UnitLobes, fibonacci_cells
-from factorlib.inference.materials import Materials, Point
-from factorlib.inference.observed import blocks_of_observations
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
+from factorlib.inference.model.interreflection import bounced_light
+from factorlib.inference.model.lights import Light, UnitLobes, fibonacci_cells
+from factorlib.inference.model.materials import Materials, Point
+from factorlib.inference.model.observed import blocks_of_observations
+from factorlib.inference.model.problem import JointProblem
 from factorlib.light.lobes import lobe_energy
 from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_block
 from factorlib.urm.observations import Observations

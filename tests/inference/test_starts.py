@@ -6,15 +6,11 @@ import pytest
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference import joint_solver, model_selection
-from factorlib.inference.fit import FitSchedule
-from factorlib.inference.fit_runner import PHASES, Event, FitRunner, solve_progress
-from factorlib.inference.forward import Illumination
-from factorlib.inference.joint_solver import solve
-from factorlib.inference.materials import Materials
-from factorlib.inference.options import SolveOptions
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import (
+from factorlib.inference import joint_solver
+from factorlib.inference.choices import model_selection
+from factorlib.inference.fit.fit import FitSchedule
+from factorlib.inference.fit.fit_runner import PHASES, Event, FitRunner, solve_progress
+from factorlib.inference.fit.start import (
     InitialFit,
     point_from_earlier,
     start_from_earlier,
@@ -22,6 +18,11 @@ from factorlib.inference.start import (
     start_from_surface,
     with_earlier_decisions,
 )
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.materials import Materials
+from factorlib.inference.model.problem import JointProblem
+from factorlib.inference.options import SolveOptions
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import EarlierSolution
 from factorlib.scenes.joint_problems import MATERIALS, factor_between, random_light, sphere_block

@@ -9,17 +9,17 @@ from scipy.linalg import block_diag
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.inference import surface_turns
-from factorlib.inference.blocks import FIT_LOSS
-from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_problem, light_likelihood
-from factorlib.inference.materials import Point
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import start_from_photos
-from factorlib.inference.surface_detail import (
+from factorlib.inference.fit.fit import Fit, FitSchedule, Hyperparameters, fit_problem, light_likelihood
+from factorlib.inference.fit.start import start_from_photos
+from factorlib.inference.model.blocks import FIT_LOSS
+from factorlib.inference.model.materials import Point
+from factorlib.inference.model.problem import JointProblem
+from factorlib.inference.surface import surface_turns
+from factorlib.inference.surface.surface_detail import (
     DetailTrial,
     estimate_surface,
 )
-from factorlib.inference.surface_turns import (
+from factorlib.inference.surface.surface_turns import (
     LARGEST_TURN,
     LEAST_VIEW_COSINE,
     PULL_SHARE,

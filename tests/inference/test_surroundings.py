@@ -7,7 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.background import (
+from factorlib.inference.choices.model_selection import select_grounds
+from factorlib.inference.fit.fit import Hyperparameters, initial_fit, light_likelihood
+from factorlib.inference.fit.fit_runner import FitRunner
+from factorlib.inference.fit.optimizer import step_light
+from factorlib.inference.fit.start import start_from_photos
+from factorlib.inference.held_out_photos import fit_lights_given_materials
+from factorlib.inference.joint_solver import LIGHTS, solve
+from factorlib.inference.model.background import (
     DEVIATION,
     SCALE_DEVIATION,
     SHARED_COVARIANCE,
@@ -15,20 +22,13 @@ from factorlib.inference.background import (
     concatenate_backgrounds,
     condition_on_background,
 )
-from factorlib.inference.blocks import FIT_LOSS, Block, Noise
-from factorlib.inference.cast_shadows import CastShadows, cast_shadows
-from factorlib.inference.fit import Hyperparameters, initial_fit, light_likelihood
-from factorlib.inference.fit_runner import FitRunner
-from factorlib.inference.forward import Illumination
-from factorlib.inference.held_out_photos import fit_lights_given_materials
-from factorlib.inference.joint_solver import LIGHTS, solve
-from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import select_grounds
-from factorlib.inference.observed import blocks_of_observations, read_grounds
-from factorlib.inference.optimizer import step_light
+from factorlib.inference.model.blocks import FIT_LOSS, Block, Noise
+from factorlib.inference.model.cast_shadows import CastShadows, cast_shadows
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.materials import Point
+from factorlib.inference.model.observed import blocks_of_observations, read_grounds
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.paper_solver import PaperOptions, solve_paper
-from factorlib.inference.start import start_from_photos
 from factorlib.scenes.joint_problems import MATERIALS, observations_from_front, sphere_normals
 from factorlib.urm.observations import concatenate, write_observations
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, on_even_cells, photographed

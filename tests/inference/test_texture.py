@@ -6,8 +6,8 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from factorlib.generate.solids import sphere
-from factorlib.inference import texture
-from factorlib.inference.texture import PULL, TextureSamples, observe_texture, select_texture, solve_texture
+from factorlib.inference.surface import texture
+from factorlib.inference.surface.texture import PULL, TextureSamples, observe_texture, select_texture, solve_texture
 from factorlib.meshes import subdivision
 from factorlib.meshes.subdivision import subdivided_mesh
 

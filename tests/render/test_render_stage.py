@@ -9,7 +9,7 @@ from factorlib.conventions import FRONT, YUP_FROM_CAMERA, lat_long_directions, l
 from factorlib.geometry.sphere import NO_OCCLUDER, ball_normals, fibonacci_sphere
 from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.tone import curve
-from factorlib.inference.interreflection import bounced_light
+from factorlib.inference.model.interreflection import bounced_light
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes

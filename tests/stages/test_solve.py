@@ -10,9 +10,9 @@ import pytest
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
-from factorlib.inference.blocks import Noise
-from factorlib.inference.forward import Illumination
-from factorlib.inference.observed import blocks_of_observations
+from factorlib.inference.model.blocks import Noise
+from factorlib.inference.model.forward import Illumination
+from factorlib.inference.model.observed import blocks_of_observations
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, lobe_energy

@@ -8,8 +8,8 @@ from factorlib.dataset.schema import MeshEntry
 from factorlib.generate.solids import sphere
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import write_exr
-from factorlib.inference.blocks import Noise
-from factorlib.inference.observed import blocks_of_observations, gather_observations
+from factorlib.inference.model.blocks import Noise
+from factorlib.inference.model.observed import blocks_of_observations, gather_observations
 from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh

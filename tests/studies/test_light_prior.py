@@ -9,7 +9,7 @@ import pytest
 
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import write_rgb_exr
-from factorlib.inference.material_prior import Classes
+from factorlib.inference.model.material_prior import Classes
 from factorlib.jsonfile import read_json
 from factorlib.light.prior import LightPrior
 from studies.measured import light_prior, material_classes

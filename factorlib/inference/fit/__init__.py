@@ -1,0 +1,1 @@
+"""Fit: marginal likelihood, its optimiser, hyperparameters, and initial values."""

@@ -1,0 +1,1 @@
+"""Model: observations, lights, materials, their priors and errors, and the radiance that they predict."""

@@ -1,0 +1,1 @@
+"""Surface: normals from shading, paint, and the lights that they are estimated from."""
