@@ -105,12 +105,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress, decided:
     check(params)
     declared = _known_values(params, inputs)
     slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    selected = read_surface(inputs.folders.get("surface")).lights
-    names_solved = {
-        name: slices[name].illumination
-        for name in solved_photos(slices)
-        if selected is None or slices[name].illumination in {*selected, *declared.maps, *declared.balls}
-    }
+    solved_lights = select_photos(inputs, slices, declared)
     files = sorted(inputs["urm"].glob("*.parquet"))
     photos = gather_observations(
         files,
@@ -119,11 +114,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress, decided:
         inputs.folders.get("surface"),
         lambda: progress(READING * next(read) / len(files), 1, "observations"),
     )
-    solved = [photo for photo, file in zip(photos, files, strict=True) if file.stem in names_solved]
+    solved = [photo for photo, file in zip(photos, files, strict=True) if file.stem in solved_lights]
     _warn(unusable_observations(solved))
-    # share of the time until lights are fitted one by one
-    apart = {light.illumination for light in slices.values()} - set(names_solved.values())
-    share = 1 / (1 + LIGHT_COST * len(apart) / max(len(set(names_solved.values())), 1))
+    apart = {light.illumination for light in slices.values()} - set(solved_lights.values())
+    share = 1 / (1 + LIGHT_COST * len(apart) / len(set(solved_lights.values())))
     progress, last = part_of(progress, 0, share), part_of(progress, share, 1)
     observations = urm.with_exposures(urm.concatenate([photo.merged for photo in solved]), declared.exposure)
     relative = urm.relative_exposures(observations)
@@ -148,13 +142,21 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress, decided:
     write_json(out / "uncertainty.json", answer.uncertainty())
     everything = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
     unsolved = UnsolvedPhotos(params, inputs, everything, answer)
-    lights, exposures = unsolved.lights_and_exposures(slices, names_solved, last)
+    lights, exposures = unsolved.lights_and_exposures(slices, solved_lights, last)
     write_lobes(out / "lobes.parquet", lights)
     write_json(out / "exposures.json", exposures)
     write_rows(out / "convergence.parquet", Event, solution.history)
     (out / "coverage").mkdir()
     for name, coverage in coverages.items():
         write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
+
+
+def select_photos(inputs: Inputs, slices: Mapping[str, LightSlice], declared: KnownSlice) -> dict[str, str]:
+    """Return the photos that materials are solved from, with their lights: the selected ones, and known ones."""
+    selected = read_surface(inputs.folders.get("surface")).lights
+    chosen = {*selected, *declared.maps, *declared.balls} if selected is not None else None
+    lights = {name: slices[name].illumination for name in solved_photos(slices)}
+    return {name: light for name, light in lights.items() if chosen is None or light in chosen}
 
 
 def check(params: Params) -> None:
