@@ -49,7 +49,7 @@ test-long: .venv/ready
 
 docs: .venv/ready
 	@test -x .venv/bin/mkdocs || EXTRAS=docs $(PY) -I factorlib/setup.py extras
-	@NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build -q && echo 'build/docs/index.html'
+	@NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build -q --strict && echo 'build/docs/index.html'
 
 # reads ONLY, LIGHTS and REAL from the environment
 results: .venv/ready

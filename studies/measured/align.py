@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from factorlib.align.photo_alignment import KnownFocal, ObjectToAlign, align_photo
 from factorlib.align.reliability import find_doubts, measure_reliability
@@ -149,7 +148,7 @@ def rows() -> Tables:
     """Return tables of success by kind and shape, doubts about provoked failures, time and memory by kind."""
     keys = [(k, shape, s, n) for k in VIEWS for s in range(SEEDS) for shape in SHAPES for n in range(VIEWS[k])]
     with ProcessPoolExecutor(JOBS, mp_context=get_context("spawn")) as pool:
-        return tables_of(list(tqdm(pool.map(measure, keys), total=len(keys), desc="poses")))
+        return tables_of(list(pool.map(measure, keys)))
 
 
 def doubtful(rows: list[dict]) -> str:

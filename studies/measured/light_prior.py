@@ -19,20 +19,18 @@ EXPOSURE_VARIANCE.
 """
 
 import hashlib
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
 import numpy as np
-import typer
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import digamma, gammaln
-from tqdm import tqdm
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.sphere import fibonacci_sphere
@@ -62,7 +60,7 @@ def prior_of(paths: Sequence[Path], scored: bool = True) -> LightPrior:
     scored: with its leave-one-out scores, which take most of the time
     """
     cells = fibonacci_sphere(CELLS)
-    logs = log_cells(np.stack([cell_means(read_light_map(path), cells) for path in tqdm(paths, desc="reading")]))
+    logs = log_cells(np.stack([cell_means(read_light_map(path), cells) for path in paths]))
     sources = tuple(SourceMap(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
     scores = leave_one_out(logs, cells) if scored and len(paths) > 1 else None
     return round_numbers(msgspec.structs.replace(fit_prior(logs, cells), made_from=sources, leave_one_out=scores))
@@ -207,7 +205,8 @@ def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"]) -> LeaveOneOut:
     whole = fit_prior(logs, cells)
     flat = fit_prior(logs, cells, profile=False)
     scores = []
-    for m in tqdm(range(logs.shape[1]), desc="leaving one out"):
+    for m in range(logs.shape[1]):
+        print(f"map {m + 1} of {logs.shape[1]} is left out", end="\r", flush=True)
         training = np.delete(logs, m, axis=1)
         held_out = logs[:, m : m + 1]
         prior = fit_prior(training, cells, start=whole)
@@ -230,11 +229,14 @@ def round_numbers(prior: LightPrior) -> LightPrior:
     return msgspec.structs.replace(prior, **{name: short(getattr(prior, name)) for name in names}, leave_one_out=scores)
 
 
-def main(folders: list[Path], out: Annotated[Path | None, typer.Option(help="File to write to.")] = None) -> None:
+def main(folders: Sequence[Path], out: Path | None = None) -> None:
     """Fit the prior on natural light to the lat-long maps (.hdr, .exr) in some folders; print it, or write a file."""
     prior = prior_of(maps_in(folders))
     print(json_text(prior)) if out is None else write_json(out, prior)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    parser = ArgumentParser(description=main.__doc__)
+    parser.add_argument("folders", type=Path, nargs="+")
+    parser.add_argument("--out", type=Path, help="file to write to")
+    main(**vars(parser.parse_args()))
