@@ -6,9 +6,8 @@ With --docs the tables of docs/studies.md are written anew afterwards.
 
 import os
 import sys
-from typing import Annotated
-
-import typer
+from argparse import ArgumentParser
+from collections.abc import Sequence
 
 from factorlib.__main__ import raise_on_signals, switched_on
 from factorlib.errors import InputError, did_you_mean
@@ -18,16 +17,9 @@ from studies.run import make, studies
 from studies.study import FULL, QUICK
 
 
-def study_command(
-    names: Annotated[list[str] | None, typer.Argument(help="studies; all without it; else STUDY")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
-    one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
-    docs: Annotated[
-        bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew, of full studies")
-    ] = False,
-) -> None:
+def main(names: Sequence[str], quick: bool, one: bool, docs: bool) -> int:
     """Run the steps of studies that are not current, or all with FORCE=1; SET="executor=tcp://…" names the executor."""
-    named = names or (os.environ.get("STUDY", "").split() if one else [])
+    named = list(names) or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
     scale = QUICK if switched_on("QUICK", quick) else FULL
@@ -38,15 +30,18 @@ def study_command(
         from studies.run.tables import refresh_docs
 
         refresh_docs(named or list(STUDIES))
-    raise typer.Exit(code)
+    return code
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-    app.command()(study_command)
+    parser = ArgumentParser("python -m studies", description=main.__doc__)
+    parser.add_argument("names", nargs="*", help="studies; all without it; else STUDY")
+    parser.add_argument("--quick", action="store_true", help="one seed, smallest sets; as QUICK=1")
+    parser.add_argument("--one", action="store_true", help="a study must be named")
+    parser.add_argument("--docs", action="store_true", help="also write the tables of docs/studies.md, of full studies")
     try:
         with raise_on_signals():
-            app(prog_name="python -m studies")
+            sys.exit(main(**vars(parser.parse_args())))
     except InputError as error:
         sys.exit(f"error: {error}")
     except OSError as error:

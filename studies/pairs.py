@@ -18,15 +18,15 @@ Cause      the same with one factor recovered and the others true.  The factor p
 """
 
 import sys
+from argparse import ArgumentParser
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import typer
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation, gaussian_filter
 
@@ -239,12 +239,7 @@ def paired_difference(a: Image, b: Image) -> Float[np.ndarray, "h w"]:
     return np.linalg.norm(a - b, axis=-1)
 
 
-def main(
-    build: Annotated[Path, typer.Argument(help="results of a rendered set of chairs, such as build/eames")],
-    count: Annotated[int, typer.Option(min=1, help="pairs")] = 20,
-    samples: Annotated[int, typer.Option(min=1, help="a pixel")] = 256,
-    seed: Annotated[int, typer.Option(min=0, help="of objects and their places")] = 39,
-) -> None:
+def main(build: Path, count: int, samples: int, seed: int) -> None:
     """Render pairs, and write a table of their differences."""
     out = ROOT / "build/studies/pairs"
     rows = []
@@ -267,7 +262,11 @@ def main(
 
 
 if __name__ == "__main__":
+    parser = ArgumentParser(description=main.__doc__)
+    parser.add_argument("build", type=Path, help="results of a rendered set of chairs, such as build/eames")
+    for name, default, meaning in (("count", 20, "pairs"), ("samples", 256, "a pixel"), ("seed", 39, "of the objects")):
+        parser.add_argument(f"--{name}", type=int, default=default, help=meaning)
     try:
-        typer.run(main)
+        main(**vars(parser.parse_args()))
     except InputError as error:
         sys.exit(f"error: {error}")

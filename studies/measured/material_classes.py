@@ -12,11 +12,10 @@ import csv
 import hashlib
 import io
 import re
+from argparse import ArgumentParser
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 from factorlib.errors import InputError
 from factorlib.inference.model.material_prior import Classes, MaterialClass
@@ -84,11 +83,14 @@ def _deviation(tints: np.ndarray) -> float:
     return round(float(np.median(np.linalg.norm(tints, axis=1)) / RAYLEIGH), 3)
 
 
-def main(file: Path, out: Annotated[Path | None, typer.Option(help="File to write to.")] = None) -> None:
+def main(file: Path, out: Path | None = None) -> None:
     """Fit the classes of materials to a table of measured ones; print them, or write them to a file."""
     classes = classes_of(file)
     print(json_text(classes)) if out is None else write_json(out, classes)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    parser = ArgumentParser(description=main.__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--out", type=Path, help="file to write to")
+    main(**vars(parser.parse_args()))

@@ -9,12 +9,12 @@ of the same data set, such as one with another `solve.seed`, stand in for the tr
 so that less than one standard error should lie between them.
 """
 
+from argparse import ArgumentParser
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from jaxtyping import Float
 
 from factorlib.errors import InputError
@@ -70,10 +70,7 @@ def light_deviations(build: Path, other: Path | None = None) -> Float[np.ndarray
     return np.concatenate(deviations)
 
 
-def main(
-    builds: Annotated[list[Path], typer.Argument(help="folders of results, such as build/eames")],
-    other: Annotated[Path | None, typer.Option(help="another run of the same data set, instead of the truth")] = None,
-) -> None:
+def main(builds: Sequence[Path], other: Path | None = None) -> None:
     """Print the shares within one standard error, and the median deviation in standard errors."""
     rows = []
     for build in builds:
@@ -86,4 +83,7 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    parser = ArgumentParser(description=main.__doc__)
+    parser.add_argument("builds", type=Path, nargs="+", help="folders of results, such as build/eames")
+    parser.add_argument("--other", type=Path, help="another run of the same data set, instead of the truth")
+    main(**vars(parser.parse_args()))
