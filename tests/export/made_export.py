@@ -20,10 +20,9 @@ from factorlib.jsonfile import write_json
 from factorlib.light.lobes import SUN, Lobes, lobe_energy
 from factorlib.meshes.read_mesh import read_mesh
 from factorlib.reflection.network import SHIPPED
-from factorlib.results.lobe_table import write_lobes
 from factorlib.stage import Inputs
 from stages import export
-from tests.stages.made import ran
+from tests.stages.made import poses_of, ran, write_aligned, write_solution
 
 NAMES = ["red", "brass", "unseen"]
 MATERIALS = {
@@ -100,27 +99,14 @@ def make(folder: Path) -> Inputs:
             "objects": [{"name": "chair", "mesh": mesh}],
             "meshes": {mesh: {"file": f"{mesh}.obj", "parts": PARTS[mesh]}},
         }
-        place = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}
-        lens = {"focal_px": camera.focal, "principal_point": list(camera.centre)}
-        poses[photo] = {"camera": lens, "objects": {"chair": place}}
+        poses[photo] = poses_of(camera, chair=pose)
         maps = rasterise(read_mesh(files[f"{mesh}.obj"], NAMES, PARTS[mesh]), camera, pose)
         inside = maps.label > 0
-        channels = {
-            **{f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")},
-            "depth": maps.depth,
-            "label": maps.label,
-            "object": maps.object,
-            "confidence": inside,
-        }
-        write_exr(folder / "align" / f"{photo}.exr", channels)
+        write_aligned(folder / "align", photo, maps)
         grey = {c: 0.3 * inside for c in "RGB"} | {"label": maps.label, "valid": inside, "left_out": 0 * inside}
         write_exr(folder / "masks" / f"{photo}.exr", grey)
     write_json(folder / "align" / "poses.json", poses)
-    stderr = {"diffuse": [0.1] * 3, "specular": [0.1] * 3, "roughness": 0.1}
-    table = {n: {**m, "alpha": m["roughness"] ** 2, "stderr": stderr} for n, m in MATERIALS.items()}
-    write_json(folder / "solve" / "materials.json", {"materials": table, "gauge": {"rule": "by hand"}, "model": {}})
-    write_json(folder / "solve" / "exposures.json", EXPOSURES)
-    write_lobes(folder / "solve" / "lobes.parquet", lights())
+    write_solution(folder / "solve", MATERIALS, lights(), EXPOSURES)
     return Inputs({stage: folder / stage for stage in ("align", "masks", "solve")}, facts, files)
 
 

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from factorlib.geometry.camera import Pose
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Maps
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
+from factorlib.results.lobe_table import write_lobes
 
 
 class Killed(Exception):
@@ -43,6 +45,28 @@ def write_masks(folder: Path, photo: str, label: np.ndarray, focal, source, chan
 def entry_of(pose: Pose, **more) -> dict:
     """A pose as dataset.yaml and poses.json have it."""
     return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), **more}
+
+
+def write_aligned(folder: Path, photo: str, maps: Maps, **channels) -> None:
+    """The maps of `align` for a photo in which every pixel of an object is sure, with further channels."""
+    axes = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
+    plain = {"label": maps.label, "depth": maps.depth, "object": maps.object, "confidence": maps.label > 0}
+    write_exr(folder / f"{photo}.exr", {**axes, **plain, **channels})
+
+
+def poses_of(camera: Camera, **poses: Pose) -> dict:
+    """The entry of a photo in poses.json."""
+    lens = {"focal_px": camera.focal, "principal_point": list(camera.centre)}
+    return {"camera": lens, "objects": {name: entry_of(pose, silhouette_iou=1.0) for name, pose in poses.items()}}
+
+
+def write_solution(folder: Path, materials: dict, lights: dict, exposures: dict) -> None:
+    """What `solve` leaves for the stages after it, of materials by their diffuse, specular and roughness."""
+    stderr = {"diffuse": [0.1] * 3, "specular": [0.1] * 3, "roughness": 0.1}
+    table = {n: {**m, "alpha": m["roughness"] ** 2, "stderr": stderr} for n, m in materials.items()}
+    write_json(folder / "materials.json", {"materials": table, "gauge": {"rule": "by hand"}, "model": {}})
+    write_json(folder / "exposures.json", exposures)
+    write_lobes(folder / "lobes.parquet", lights)
 
 
 def chair_facts(material: str = "white", **more) -> dict:

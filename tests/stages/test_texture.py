@@ -17,7 +17,6 @@ from factorlib.meshes.read_mesh import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.render.resynthesis import Reflector
-from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.texture_table import TextureTable, read_table, read_textures
 from factorlib.stage import Inputs
@@ -25,7 +24,7 @@ from stages import shading, texture
 from tests.export.made_export import light, write_obj
 from tests.refusal import refusal
 from tests.runner.toy import files_of
-from tests.stages.made import ran
+from tests.stages.made import poses_of, ran, write_aligned, write_solution
 
 CAMERA = Camera(48, 48, 68.0, (24.0, 24.0))
 TURNS = {"a": 0.0, "b": 35.0, "c": -40.0}
@@ -59,21 +58,12 @@ def photographed(folder: Path, paint) -> Inputs:
         diffuse, specular = reflect.parts(Reflectance(**MATERIAL), normals, views)
         radiance[y, x] = diffuse * paint((point - pose.translation) @ pose.rotation) + specular
         inside = (maps.label > 0).astype(float)
-        each = [(kind, a, k) for kind in ("normal", "view") for k, a in enumerate("xyz")]
-        channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind, a, k in each}
-        channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": inside}
-        write_exr(folder / "align" / f"{name}.exr", channels)
+        write_aligned(folder / "align", name, maps)
         photo = dict(zip("RGB", np.moveaxis(radiance, -1, 0))) | {"label": maps.label, "valid": inside}
         write_exr(folder / "masks" / f"{name}.exr", photo | {f"clipped.{c}": 0 * inside for c in "RGB"})
-        place = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}
-        lens = {"focal_px": CAMERA.focal, "principal_point": list(CAMERA.centre)}
-        poses[name] = {"camera": lens, "objects": {"ball": place}}
+        poses[name] = poses_of(CAMERA, ball=pose)
     write_json(folder / "align" / "poses.json", poses)
-    stderr = {"diffuse": [0.1] * 3, "specular": [0.1] * 3, "roughness": 0.1}
-    solved = {"red": {**MATERIAL, "alpha": 0.16, "stderr": stderr}}
-    write_json(folder / "solve" / "materials.json", {"materials": solved, "gauge": {"rule": "by hand"}, "model": {}})
-    write_json(folder / "solve" / "exposures.json", {})
-    write_lobes(folder / "solve" / "lobes.parquet", lights)
+    write_solution(folder / "solve", {"red": MATERIAL}, lights, {})
     facts = {"dataset.materials": ["red"], "dataset.objects": dict.fromkeys(TURNS, entry)}
     facts["dataset.light"] = {name: {"illumination": name, "world_from_camera": None} for name in TURNS}
     folders = {stage: folder / stage for stage in ("align", "masks", "solve", "shading")} | {"train": SHIPPED}

@@ -17,7 +17,7 @@ from factorlib.urm.observations import read_observations
 from factorlib.urm.reduction import sample
 from stages import urm
 from tests.align.scenes import ball, mesh_of
-from tests.stages.made import ran
+from tests.stages.made import poses_of, ran, write_aligned
 
 CAMERA = Camera(80, 60, 90.0, (40.0, 30.0))
 LEFT, RIGHT = Pose(np.eye(3), np.array([-1.05, 0.0, 6.0])), Pose(np.eye(3), np.array([1.05, 0.0, 6.0]))
@@ -30,18 +30,12 @@ def step(folder, poses: dict[str, Pose]):
     inside = (maps.label > 0).astype("f4")
     for stage in ("masks", "align"):
         (folder / stage).mkdir(parents=True)
-    channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
-    write_exr(
-        folder / "align" / "a.exr",
-        {**channels, "label": maps.label, "depth": maps.depth, "confidence": inside, "object": maps.object},
-    )
+    write_aligned(folder / "align", "a", maps)
     channels = dict.fromkeys("RGB", inside) | {"left_out": 0 * inside} | {f"clipped.{c}": 0 * inside for c in "RGB"}
     write_exr(folder / "masks" / "a.exr", {**channels, "label": maps.label, "valid": inside})
     size = [CAMERA.width, CAMERA.height]
     write_json(folder / "masks" / "a.json", {"width": size[0], "height": size[1], "factor": 1, "original_size": size})
-    placed = {n: {"rotation": p.rotation.tolist(), "translation": p.translation.tolist()} for n, p in poses.items()}
-    camera = {"focal_px": CAMERA.focal, "principal_point": list(CAMERA.centre)}
-    write_json(folder / "align" / "a.json", {"camera": camera, "objects": placed})
+    write_json(folder / "align" / "a.json", poses_of(CAMERA, **poses))
     write_ply(folder / "ball.ply", mesh)
     facts = {
         "dataset.materials": ["white"],
