@@ -26,15 +26,13 @@ from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import (
-    bsdf,
     envmap,
     incident_light,
     look_rotation,
-    paint,
+    painted_shape,
     render_scene,
     rigid,
     sensor,
-    shape,
 )
 from factorlib.yamlfile import read_yaml
 
@@ -274,15 +272,9 @@ def render_shot(
     place = rigid(world_from_light, (0, SET.middle - EYE, 0))
     light = incident_light(around, place, parameters.light_rows, parameters.light_spp, seed)
     solids = {
-        f"{name}_{label}": _part(submesh(mesh, label), materials[label - 1], world_from_object)
+        f"{name}_{label}": painted_shape(submesh(mesh, label), materials[label - 1], world_from_object)
         for mesh, (name, world_from_object) in zip(meshes, scene.chairs.items(), strict=True)
         for label in mesh.labels
     }
     film = sensor(scene.camera, scene.world_from_camera)
     return light, render_scene(around | solids, film, parameters.spp, seed, max_depth=-1)
-
-
-def _part(mesh: Mesh, material: Reflectance, world_from_object: Float[np.ndarray, "4 4"]) -> Any:
-    """Return a part of a chair as a Mitsuba shape, with the colours of its paint if it has any."""
-    colours = None if mesh.detail is None else paint(material, mesh.detail)
-    return shape(mesh, bsdf(material, painted=colours is not None), world_from_object, colours=colours)

@@ -28,17 +28,15 @@ from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import (
     NARROWEST,
     Matrix,
-    bsdf,
     envmap,
     envmap_of_nodes,
     mitsuba_map,
-    paint,
+    painted_shape,
     render_denoised,
     render_scene,
     rgb,
     rigid,
     sensor,
-    shape,
     transform,
 )
 
@@ -158,12 +156,9 @@ def shapes(objects: Sequence[PlacedMesh], materials: Mapping[str, Reflectance]) 
     entries = {}
     for each in objects:
         for label in each.mesh.labels:
-            material = materials[each.materials[label - 1]]
             part = submesh(each.mesh, label)
-            colours = None if part.detail is None else paint(material, part.detail)
-            surface = bsdf(material, painted=colours is not None)
-            surface = {"type": "twosided", "bsdf": surface} if each.mesh.open else surface
-            entries[f"{each.name}_{label}"] = shape(part, surface, each.world_from_object, colours=colours)
+            material = materials[each.materials[label - 1]]
+            entries[f"{each.name}_{label}"] = painted_shape(part, material, each.world_from_object)
     return entries
 
 

@@ -93,7 +93,6 @@ def shape(
     mesh: Mesh,
     material: Entry,
     world_from_object: Matrix = np.eye(4),
-    emitter: Entry | None = None,
     colours: Float[np.ndarray, "v 3"] | None = None,
 ) -> Any:
     """Load a mesh as a Mitsuba shape, with its own vertex normals.
@@ -102,7 +101,6 @@ def shape(
         mesh: The mesh.
         material: BSDF.
         world_from_object: Transform of the mesh.
-        emitter: Emitter on the surface.
         colours: Colours of the vertices.
 
     Returns:
@@ -112,7 +110,15 @@ def shape(
         path = Path(folder) / "mesh.ply"
         write_ply(path, mesh, colours)
         entry = {"type": "ply", "filename": str(path), "to_world": transform(world_from_object), "bsdf": material}
-        return mitsuba().load_dict(entry | ({"emitter": emitter} if emitter else {}))
+        return mitsuba().load_dict(entry)
+
+
+def painted_shape(mesh: Mesh, material: Reflectance, world_from_object: Matrix = np.eye(4)) -> Any:
+    """Load a mesh of one material, with its detail as paint, as a Mitsuba shape."""
+    colours = None if mesh.detail is None else paint(material, mesh.detail)
+    surface = bsdf(material, painted=colours is not None)
+    two_sided = {"type": "twosided", "bsdf": surface} if mesh.open else surface
+    return shape(mesh, two_sided, world_from_object, colours)
 
 
 def sensor(

@@ -38,7 +38,7 @@ from factorlib.meshes.ply_stl_off import submesh
 from factorlib.meshes.subdivision import subdivide
 from factorlib.results.materials import Reflectance
 from factorlib.scenes.bodies import bumpy_ball, jug, mesh_from_parts, stack
-from factorlib.tracing.scene import bsdf, envmap, paint, render_scene, rigid, sensor, shape
+from factorlib.tracing.scene import envmap, painted_shape, render_scene, rigid, sensor
 from factorlib.wholefile import write_bytes, write_text
 from studies.measured.tools import ROOT, evaluate_dataset, machine, markdown_table, run_verb
 
@@ -142,9 +142,7 @@ def generate_walk(name: str, folders: Sequence[Path]) -> Path:
     (unfinished / "truth").mkdir(parents=True)
     around: dict[str, Any] = {"light": envmap(light, FINER)}
     for label, material in zip(mesh.labels, MATERIALS.values(), strict=False):
-        part = submesh(mesh, label)
-        colours = paint(material, part.detail) if label == walk.painted and part.detail is not None else None
-        around[f"part_{label}"] = shape(part, bsdf(material, colours is not None), colours=colours)
+        around[f"part_{label}"] = painted_shape(submesh(mesh, label), material)
     frames = []
     pictures = []
     for number, (camera, world_from_camera) in enumerate(walk_cameras()):
