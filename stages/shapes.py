@@ -6,6 +6,7 @@ or meshes.  Writes shapes.json, and meshes/<mesh>.obj, which later stages read a
 
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -59,9 +60,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for index, (name, entry) in enumerate(sorted(slice_.meshes.items())):
         outlines = [each for photo in photos.values() for each in photo.outlines(name, entry, cameras.get(photo.name))]
         outlines = [outline for outline in outlines if outline.is_visible]
-        share = _share(first_share + part * index, part, name, progress)
+        begin = first_share + part * index
         try:
-            shape = estimate_shape(entry, outlines, params, share, factors)
+            report = partial(lambda begin, name, share: progress(begin + part * share, 1, name), begin, name)
+            shape = estimate_shape(entry, outlines, params, report, factors)
         except InputError as error:
             raise InputError(error.fault, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_triangles(out / "meshes" / f"{name}.obj", shape, shape_parts(entry))
@@ -78,11 +80,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             )
     write_json(out / FILE, ShapesTable(cameras, shapes))
     progress(1, 1)
-
-
-def _share(begin: float, part: float, name: str, progress: Progress) -> Callable[[float], None]:
-    """Return the report of one mesh, whose share of the work begins at `begin` and is `part`."""
-    return lambda share: progress(begin + part * share, 1, name)
 
 
 def estimate_cameras(

@@ -67,8 +67,8 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
     refusals = []
     for index, photo in enumerate(photos):
         try:
-            report = partial(_report_photo, progress, index, len(photos), photo)
-            report(0)
+            progress(index, len(photos), photo)
+            report = partial(lambda done, name, share: progress(done + share, len(photos), name), index, photo)
             facts = WRITERS[type(recipe)](recipe, results, photo, out, report) or {}
             if facts:
                 write_json(out / f"{photo}.json", facts)
@@ -81,11 +81,6 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
     if len(refusals) == len(photos):
         raise refusals[0]
     progress(len(photos), len(photos))
-
-
-def _report_photo(progress: Progress, done: int, total: int, photo: str, share: float) -> None:
-    """Report the progress within one photo; `share`, in [0, 1], is the part of it that is done."""
-    progress(done + share, total, photo)
 
 
 Report = Callable[[float], None]

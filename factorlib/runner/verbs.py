@@ -24,7 +24,7 @@ from factorlib.runner.dataset_state import DatasetState, Request, read_state
 from factorlib.runner.plan import PlannedStep, Step, summarize
 from factorlib.runner.project import RESERVED, Pipeline, Project, StageCode, check_name, read_pipeline
 from factorlib.runner.results_folder import results_of
-from factorlib.runner.store import Entry, is_locked
+from factorlib.runner.store import is_locked
 
 # exit codes as in shells
 INTERRUPTED = 128 + signal.SIGINT
@@ -140,18 +140,13 @@ def show_status(project: Project, request: Request) -> int:
     for name, numbers in counts.items():
         print(f"{name:<10} {', '.join(f'{numbers[status]} {status}' for status in STATUSES if numbers[status])}")
     for p in planned:
-        if entry := _result(state, p):
+        if p.status == "current" and (entry := state.store.entry(p.key)):
             print(*(f"warning: {p.step}: {text}\n" for text in entry.warnings), sep="", end="")
     failures = state.results.failures()
     for p in planned:
         if p.status != "current" and p.key in failures:
             print(f"error: {p.step}: {failures[p.key]}")
     return 0
-
-
-def _result(state: DatasetState, planned: PlannedStep) -> Entry | None:
-    """Return the result of a current step."""
-    return state.store.entry(planned.key) if planned.status == "current" else None
 
 
 def show_params(project: Project, stages: list[str] | None) -> int:
