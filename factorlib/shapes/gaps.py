@@ -23,7 +23,7 @@ from scipy.ndimage import distance_transform_edt, label
 from factorlib.align.silhouette import UNKNOWN, bounding_box
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.shapes.hull import consensus_box, grid_over, hull_surface, signed_distance
+from factorlib.shapes.hull import LEAST_Z, consensus_box, grid_over, hull_surface, signed_distance
 from factorlib.shapes.outline import Outline, Triangles
 
 GRID_CELLS = 80  # cells of the grid's longest side
@@ -149,25 +149,27 @@ def _uncovered(hull: Triangles, outlines: Sequence[Outline]) -> tuple[list[Float
 
 
 def _pixels(outline: Outline, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return row and column of the pixels that show points, and the indices of those within the photo."""
+    """Return row and column of the pixels nearest to points, and the indices of the points within the photo."""
     place = outline.known_pose.apply(points)
-    front = np.flatnonzero(place[:, 2] > 0)
-    x, y = np.floor(outline.camera.project(place[front])).astype(int).T
+    x, y = np.floor(outline.camera.project(np.maximum(place, [-np.inf, -np.inf, LEAST_Z]))).astype(int).T
     height, width = outline.part.shape
-    within = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    return y[within], x[within], front[within]
+    within = (place[:, 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    return y.clip(0, height - 1), x.clip(0, width - 1), np.flatnonzero(within)
 
 
 def _look_up(outline: Outline, mask: Mask, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Return the points whose pixels a mask has."""
     rows, columns, index = _pixels(outline, points)
     result = np.zeros(len(points), bool)
-    result[index] = mask[rows, columns]
+    result[index] = mask[rows[index], columns[index]]
     return result
 
 
 def _places(outline: Outline, points: Float[np.ndarray, "n 3"], reach: float) -> Mask:
-    """Return the background's pixels within reach of points."""
+    """Return the background's pixels within reach of points, of which those beyond the frame count at its border.
+
+    Beyond the frame, a mask that ends just before it lacks all that the photo crops.
+    """
     rows, columns, _ = _pixels(outline, points)
     off = np.ones(outline.part.shape, bool)
     off[rows, columns] = False

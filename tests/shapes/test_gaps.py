@@ -57,6 +57,20 @@ def test_what_masks_lack_is_named_and_the_hull_is_that_of_whole_masks(blob, dama
     assert all(mended[k] is one for k, one in enumerate(cut) if k not in damages)
 
 
+def test_a_cropped_photo_whose_mask_ends_just_before_the_border_cuts_nothing(blob):
+    whole, true = blob
+    one = whole[2]
+    left = int(one.middle[0]) - 30
+    part = one.part[:, left:].copy()
+    part[:, :2] = 0
+    camera = one.camera.window(left, 0, 1, part.shape[1], part.shape[0])
+    cut = [*whole[:2], msgspec.structs.replace(one, part=part, camera=camera), *whole[3:]]
+    mended, gaps = mend_gaps(cut)
+    assert volume(cut) < 0.9 * true and volume(mended) == pytest.approx(true, rel=0.02)
+    (gap,) = gaps
+    assert gap.photo == "p2" and gap.x < 8
+
+
 def test_a_thin_part_stays_where_one_mask_lacks_it_and_where_all_have_it():
     ball, rod = trimesh.creation.icosphere(3, 0.35), trimesh.creation.cylinder(0.05, 0.7)
     rod.apply_transform(trimesh.transformations.rotation_matrix(0.9, [1, 0.4, 0])).apply_translation([0.05, 0.3, 0.1])
