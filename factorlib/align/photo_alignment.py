@@ -125,7 +125,7 @@ def align_photo(
         report(completed)
         obj = objects[k]
         view = ObjectView(obj.silhouette, focal.camera, focal.prior_sigma)
-        estimates[k] = _estimate_object(obj, view, photo, search, lambda share, done=completed: report(done + share))
+        estimates[k] = _estimate_object(obj, view, photo, search, _report_after(completed, report))
         if view.focal_sigma > 0:
             source = "estimated"
             if focal.source == "exif":
@@ -135,6 +135,11 @@ def align_photo(
     poses = [obj.pose or estimates[k].state.pose(obj.caster) for k, obj in enumerate(objects)]
     in_order = [estimates.get(k) for k in range(len(objects))]
     return PhotoAlignment(focal.camera, focal.source or "estimated", focal.stderr, poses, in_order, prior)
+
+
+def _report_after(done: int, report: Report) -> Report:
+    """Return the report of the next search, which follows `done` others."""
+    return lambda share: report(done + share)
 
 
 def _initial_focal(objects: Sequence[ObjectToAlign], known: KnownFocal, camera: Camera, sigma: float) -> Focal:
