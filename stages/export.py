@@ -2,7 +2,7 @@
 
 Writes, in the gauge that Mitsuba needs:
 
-illumination/<light>.exr, .hdr   Environment maps; a light with suns also gets <light>_sky.exr.
+illumination/<light>.exr, .hdr   Environment maps; a light with suns also gets <light>_sky.exr and <light>_suns.gltf.
 coverage/<light>.exr             Standard error of radiance over its mean, in the same layout.
 materials.json, lobes.parquet, exposures.json, lights.json
 scenes/<photo>.xml               Mitsuba scenes, with meshes and lights; the same scenes for Blender.
@@ -32,7 +32,7 @@ from factorlib.export.exported_scene import (
     write_scene_json,
     write_script,
 )
-from factorlib.export.gltf_writer import variant_name, write_glb
+from factorlib.export.gltf_writer import variant_name, write_glb, write_suns
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge, write_scene
@@ -210,6 +210,7 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     sky = light.take(~light.suns)
     if light.suns.any():
         write_rgb_exr(out / "illumination" / f"{name}{SKY}.exr", lat_long_of_lobes(sky, *lat_long.shape[:2]), LAT_LONG)
+        write_suns(out / "illumination" / f"{name}_suns.gltf", extract_suns(light, YUP_FROM_CAMERA))
     _write_mitsuba_map(out / "scenes" / "light" / f"{name}.exr", sky, params)
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)

@@ -1,4 +1,4 @@
-"""Export of meshes as binary glTF with materials and their variants.
+"""Export of meshes as binary glTF with materials and their variants, and of suns as directional lights.
 
 glTF's metallic-roughness model has GGX of the same α = roughness², with Schlick's Fresnel term from F0 to F90, over a
 diffuse part times 1 − max F.  A dielectric has F90 = 1 and F0 = 0.04, which KHR_materials_specular multiplies by
@@ -10,6 +10,9 @@ for plastics.  So k_s = 0.04 + ADDED is the ordinary dielectric, which viewers w
 
 baseColor is at most one because max k_d + max k_s is.  A k_s above that of any dielectric with little k_d is a metal:
 metallic 1, and baseColor = k_d + k_s, because a metal has no diffuse part.  Without k_s specularFactor is 0.
+
+A directional light of KHR_lights_punctual shines along its node's −z with an illuminance in lux.  The value written is
+the irradiance in the unit of the map's radiance, as a program that also shows the map needs it.
 """
 
 import json
@@ -24,8 +27,10 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from factorlib.export.exported_scene import Sun
 from factorlib.export.texture_atlas import UNKNOWN_PIXEL, Atlas, make_atlas
 from factorlib.images.picture import data_uri
+from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
 from factorlib.reading import read_bytes
@@ -38,6 +43,7 @@ ADDED = 1 / 75  # k_s − F0 of Lambert + GGX fitted to plastics with Fresnel (d
 MOST_DIELECTRIC = 0.08
 METAL = 0.25  # largest max k_d / max k_s of a material written as a metal
 EXTENSION = "KHR_materials_specular"
+LIGHTS = "KHR_lights_punctual"
 VARIANTS = "KHR_materials_variants"
 
 
@@ -201,3 +207,21 @@ def gltf_material(material: Reflectance, painted: bool = False) -> dict[str, Any
     plain = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness}
     specular = {"specularFactor": float(brightest > 0), "specularColorFactor": (f0 / DIELECTRIC).tolist()}
     return {"pbrMetallicRoughness": plain, "extensions": {EXTENSION: specular}}
+
+
+def write_suns(path: str | Path, suns: Sequence[Sun]) -> None:
+    """Write suns as a glTF scene of directional lights, in the y-up frame of the maps."""
+    lights = []
+    nodes = []
+    for number, sun in enumerate(suns):
+        intensity = float(max(sun.irradiance))
+        x, y, z = sun.direction
+        # quaternion (x, y, z, w) that turns +z to the sun
+        turn = np.array([-y, x, 0.0, 1 + z]) if z > -1 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+        colour = (sun.irradiance / intensity).tolist()
+        lights.append({"type": "directional", "color": colour, "intensity": intensity, "name": f"sun {number}"})
+        rotation = (turn / np.linalg.norm(turn)).tolist()
+        nodes.append({"rotation": rotation, "extensions": {LIGHTS: {"light": number}}, "name": f"sun {number}"})
+    scenes = [{"nodes": list(range(len(suns)))}]
+    content = {"asset": {"version": "2.0"}, "extensionsUsed": [LIGHTS], "extensions": {LIGHTS: {"lights": lights}}}
+    write_json(path, {**content, "nodes": nodes, "scenes": scenes, "scene": 0})

@@ -13,6 +13,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.export.gltf_writer import EXTENSION, gltf_material, read_parts_of_glb, write_glb
@@ -67,7 +68,7 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
             "materials.mtlx",
         ),
         *("ball.glb", "egg.glb", "meshes/ball.ply", "meshes/egg.ply", "source/ball.obj", "source/egg.obj"),
-        "illumination/room_sky.exr",
+        *("illumination/room_sky.exr", "illumination/room_suns.gltf"),
         *(f"illumination/{name}.{kind}" for name in ("front", "room") for kind in ("exr", "hdr")),
         *(f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json")),
         *("scenes/blender.py", "scenes/light/front.exr", "scenes/light/room.exr"),
@@ -106,13 +107,15 @@ def test_a_coloured_exposure_has_a_map_of_its_own(inputs, tmp_path):
 
 
 def test_suns_are_said_once_in_every_form(inputs, tmp_path):
-    """The sky and the sun together are the map."""
+    """The sky and the sun together are the map; glTF's light shines where lights.json says."""
     out = run(inputs, tmp_path / "out")
-    lights = read_json(out / "lights.json")
+    lights, tree = read_json(out / "lights.json"), read_json(out / "illumination/room_suns.gltf")
     assert lights["front"] == [] and not (out / "illumination/front_sky.exr").exists()
-    (sun,) = lights["room"]
+    (sun,), (light,), (node,) = lights["room"], tree["extensions"]["KHR_lights_punctual"]["lights"], tree["nodes"]
     whole, sky = (map_energy(read_rgb_exr(out / f"illumination/room{kind}.exr")) for kind in ("", "_sky"))
     np.testing.assert_allclose(whole - sky, sun["irradiance"], rtol=1e-3)
+    np.testing.assert_allclose(Rotation.from_quat(node["rotation"]).apply([0, 0, 1]), sun["direction"], atol=1e-6)
+    np.testing.assert_allclose(np.array(light["color"]) * light["intensity"], sun["irradiance"], rtol=1e-6)
     expected = YUP_FROM_CAMERA @ made_export.WORLD_FROM_CAMERA["side"] @ made_export.SUN_DIRECTION
     np.testing.assert_allclose(sun["direction"], expected, atol=1e-6)
 
